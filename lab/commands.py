@@ -15,10 +15,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from lensmodel.cli.console import Display
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli.console import Display, Force, UsageError
 from lensmodel.cli.files import as_usage, refuse_existing
-from lensmodel.cli.options import Force
 from lensmodel.core.types import StepHook
 
 PAGE = ("reproduction.md", "reproduction.html", "reproduction.json")  # beside pictures and stored results

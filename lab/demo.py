@@ -28,8 +28,7 @@ from app.schemas import CorrectionOut, JobOut, PhotoOut
 from lab.images import Picture, ZoneSharpness, as_shown, by_zone, fidelity, measure_edges, side_by_side
 from lab.kernels import distance
 from lab.scenes import photograph_of
-from lensmodel.cli.console import Display
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli.console import Display, UsageError
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import ZONE_WORDS, ZONES, FieldPosition, LensSettings, Planes, Zone, zone_of
 from lensmodel.photo import develop

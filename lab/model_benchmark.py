@@ -34,9 +34,9 @@ from lensmodel.core.types import (
     zone_of,
 )
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.model import variables as va
-from lensmodel.model.answer import MODES
+from lensmodel.model import query as va
 from lensmodel.model.bandwidths import reference_bandwidth
+from lensmodel.model.query import MODES
 from lensmodel.simulate import draw_lens
 
 FRAME: Final = Frame(2832, 4256)  # 12 megapixels, 3:2 (chosen)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.types import Planes
-from lensmodel.measured.page import TargetPage
+from lensmodel.measured.target import TargetPage
 
 FINE: Final = 3  # drawn samples a pixel along each axis
 MARGIN: Final = 28  # pixels around the frame for the lens to blur in: half of the largest kernel

@@ -39,8 +39,8 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import Channel, FieldPosition, Frame, LensSettings, StepHook, ignore_step
 from lensmodel.lens import Lens
 from lensmodel.model import LensModel, ModelField, ModelSettings
-from lensmodel.model.answer import PAPER
 from lensmodel.model.camera_bodies import ALIKE, circle_mm
+from lensmodel.model.query import PAPER
 from lensmodel.patches import Selector
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.development import photo_from_array

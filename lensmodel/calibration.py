@@ -28,7 +28,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.lens import Lens
 from lensmodel.measured import is_measured
 from lensmodel.model import LensModel, LensProfile, ModelSettings
-from lensmodel.model.identity import Identity, difference
+from lensmodel.model.profile import Identity, difference
 from lensmodel.photo import PhotoMetadata
 from lensmodel.photo.values import CORRECTED
 

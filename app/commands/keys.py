@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from app.commands.service import Data, opened
-from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import Json
+from lensmodel.cli.console import Json, UsageError
 from lensmodel.core.errors import InvalidInputError
 
 if TYPE_CHECKING:

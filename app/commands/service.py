@@ -12,7 +12,7 @@ import typer
 from pydantic import ValidationError
 
 from app.runtime.settings import PREFIX, Settings, described
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli.console import UsageError
 
 if TYPE_CHECKING:
     from app.blobs.storage import Storage

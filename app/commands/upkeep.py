@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 
 from app.commands.service import Data, opened
-from lensmodel.cli.console import Display
-from lensmodel.cli.options import Json, Quiet
+from lensmodel.cli.console import Display, Json, Quiet
 
 
 def doctor(

@@ -36,8 +36,7 @@ from app.store import Store
 from app.store.database import new_id
 from app.store.jobs import Kind
 from app.store.owners import ANY_OWNER
-from lensmodel.cli import ending
-from lensmodel.cli.ending import InterruptedByUser
+from lensmodel.cli.console import InterruptedByUser, handle_signals
 
 log = logging.getLogger(__name__)
 
@@ -283,6 +282,6 @@ def main() -> None:
     confine.keep_private()
     if settings.metrics_address:
         metrics.publish(settings.metrics_address)
-    ending.install()
+    handle_signals()
     with suppress(InterruptedByUser):
         Worker(settings).run()

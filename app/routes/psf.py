@@ -19,8 +19,7 @@ from app.routes.common import NOT_CHANGED, Answers, file_answer
 from app.schemas import FieldQuery, KernelOut, PsfOut, PsfQuery, Setting, Support, Units
 from lensmodel.core.errors import OutsideSupportError
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
-from lensmodel.report.lens_report import UNKNOWN
-from lensmodel.report.places import grid
+from lensmodel.report.lens_report import UNKNOWN, grid
 
 router = APIRouter(tags=["psf"], route_class=OneSession)
 

@@ -26,7 +26,7 @@ from app.runtime.settings import PREFIX, Settings
 from app.sandbox import confine
 from app.store.accounts import Accounts
 from app.store.database import Database, upgrade
-from lensmodel.cli.ending import InterruptedByUser, UsageError
+from lensmodel.cli.console import InterruptedByUser, UsageError
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
 
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 # Connections at once; more get 503 (chosen): fewer than the files that a process may have open
 MAX_CONNECTIONS: Final = 1000
 # How long open requests may take after the order to stop (chosen), and then the worker (chosen): less than a
-# command that was interrupted may take (`lensmodel.cli.ending`)
+# command that was interrupted may take (`lensmodel.cli.console`)
 GRACE_S: Final = 5
 STOP_S: Final = 8.0
 WORKER = "app.runtime.worker_main"  # module of the worker; tests replace it

@@ -27,11 +27,10 @@ from lab.cases import list_photos, photo_half, scene_of
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import FieldPosition, Frame, LensSettings, NoiseModel, ignore_step
-from lensmodel.patches.checks import details_of
 from lensmodel.patches.good_regions import FEATURES, TreeEnsemble, features_of
 from lensmodel.patches.rmap import RMapSelector
 from lensmodel.patches.select import first_reasons
-from lensmodel.patches.windows import BLOCKS_A_SIDE, measure_blocks, windows_of
+from lensmodel.patches.windows import BLOCKS_A_SIDE, details_of, measure_blocks, windows_of
 from lensmodel.simulate import draw_lens
 
 SIZE: Final = 192  # pixels of a window: that of a calibration

@@ -29,7 +29,7 @@ from lensmodel.core.types import (
 )
 from lensmodel.neural import Conditions, FieldNetwork
 from lensmodel.neural.statistics import WINDOW, patch_statistics, to_octant
-from lensmodel.patches.spread import spread_evenly
+from lensmodel.patches.select import spread_evenly
 from lensmodel.patches.windows import Patch, Selection
 from lensmodel.photo.values import LinearPhoto
 

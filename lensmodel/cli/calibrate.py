@@ -13,18 +13,17 @@ import typer
 from lensmodel.blind import estimators
 from lensmodel.blind.sampling import CalibrationEvent, configured
 from lensmodel.calibration import AHEAD, Calibration
-from lensmodel.cli import files, options
-from lensmodel.cli.console import Display
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli import console, files
+from lensmodel.cli.console import Display, UsageError
 from lensmodel.core import processes
 from lensmodel.core.types import ZONE_WORDS, LensSettings
 from lensmodel.patches import selectors
 
 
 def calibrate(
-    photos: options.Photos,
-    profile: options.Profile,
-    aperture: options.Aperture = None,
+    photos: console.Photos,
+    profile: console.Profile,
+    aperture: console.Aperture = None,
     model: Annotated[
         Literal["default", "paper"] | None,
         typer.Option(help="paper: the paper's method alone, for comparison. A profile keeps its model."),
@@ -37,17 +36,17 @@ def calibrate(
         typer.Option(help="Side of the kernels, odd, 3 to 55; default: 31, with --model paper 55."),
     ] = None,
     selector: Annotated[str, typer.Option(help=f"Of patches: {', '.join(selectors)}.")] = "r-map",
-    workers: options.Workers = None,
+    workers: console.Workers = None,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask cluster that estimates the photos.")
     ] = None,
-    any_lens: options.AnyLens = False,
+    any_lens: console.AnyLens = False,
     force: Annotated[
         bool, typer.Option("--force", help="Discard what the profile holds; begin anew.")
     ] = False,
-    json_output: options.Json = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = 0,
+    json_output: console.Json = False,
+    quiet: console.Quiet = False,
+    verbose: console.Verbose = 0,
 ) -> None:
     """Learn the blur of a lens from photos.
 

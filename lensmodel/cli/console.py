@@ -1,22 +1,33 @@
-"""What a command says: results on standard output, all else on standard error.
+"""What all commands share: what they say, how they end, and their options.
 
-Progress is a bar on a terminal and plain lines elsewhere. Words that commands, pages and reports share.
+Results go to standard output, all else to standard error; progress is a bar on a terminal and plain lines
+elsewhere.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import math
+import multiprocessing
+import os
+import signal
 import sys
+import threading
+import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, Final
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from lensmodel.core import types
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import to_json
 
 REMARKS = "lensmodel.remarks"  # Logs what was left out of a photo or replaced in it
@@ -159,3 +170,125 @@ def gain_words(gain: float | None) -> str:
     if gain is None:
         return "not known"
     return f"{gain:+.1f} dB" if abs(gain) >= 0.05 else "no change"
+
+
+# --- how a command ends ------------------------------------------------------------------------
+
+
+class UsageError(InvalidInputError):
+    """The command was called wrongly: nothing was begun; exit status 2."""
+
+
+class InterruptedByUser(BaseException):
+    """Ctrl-C or SIGTERM. Carries the number of the signal."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+_PATIENCE_S: Final = 10.0  # Cleaning up takes far less; after this the process ends all the same
+
+
+def leave_interrupts_to_the_command() -> None:
+    """In a worker process, leave Ctrl-C to the process of the command, which ends its workers."""
+    if multiprocessing.parent_process() is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def handle_signals() -> None:
+    """Turn Ctrl-C and SIGTERM into `InterruptedByUser`: each `with` and `finally` removes what is unfinished.
+
+    Worker processes are killed first: pools wait for what they began.
+    """
+    for number in _SIGNALS:
+        signal.signal(number, _stop)
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    del frame
+    for each in _SIGNALS:
+        signal.signal(each, signal.SIG_IGN)  # cleaning up is not to be interrupted
+    threading.Thread(target=_end_workers, args=(number,), daemon=True).start()
+    raise InterruptedByUser(number)
+
+
+def _end_workers(number: int) -> None:
+    end = time.monotonic() + _PATIENCE_S
+    while time.monotonic() < end:
+        for child in multiprocessing.active_children():
+            child.kill()
+        time.sleep(0.05)
+    os._exit(128 + number)
+
+
+def reason(error: Exception) -> str:
+    """Say why something could not be done and what helps; the system's errors in words."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror[:1].lower()}{error.strerror[1:]}; check the path, its rights and the disk"
+    return str(error)
+
+
+def remedy(missing: ModuleNotFoundError) -> str | None:
+    """Say what to install for a missing module; None where no extra brings it."""
+    top = (missing.name or "").partition(".")[0]
+    if top in {"app", "lab"}:
+        where = " or in the container image" if top == "app" else ""
+        return f"this command is no part of the package: it runs in the source tree{where}"
+    extra = "report" if top == "matplotlib" else "service" if "app" in sys.modules else None
+    return extra and f"{top} is not installed: pip install 'lensmodel[{extra}]'"
+
+
+# --- options that several commands share, with one wording each ---------------------------------
+
+
+def f_number(text: str) -> float:
+    """Read an aperture as people write it: 2.8, f/2.8 or F2.8."""
+    number = str(text).strip().lower().removeprefix("f").removeprefix("/")
+    try:
+        return float(number)
+    except ValueError as error:
+        raise UsageError(f"--aperture must be an f-number such as 2.8 or f/2.8, got {text!r}") from error
+
+
+def odd(side: int) -> int:
+    """Refuse a kernel without a middle pixel."""
+    if side % 2 == 0:
+        raise UsageError(f"--size must be odd, got {side}; a PSF has one middle pixel")
+    return side
+
+
+def aperture(words: str) -> Any:  # noqa: ANN401 - what `typer.Option` returns
+    """Return the option of the f-number."""
+    return typer.Option("--aperture", "-a", metavar="N", parser=f_number, help=words)
+
+
+Photos = Annotated[list[Path], typer.Argument(metavar="PHOTO", help="Photos, or folders of them.")]
+Profile = Annotated[Path, typer.Option("--profile", "-p", help="The lens profile to write or add to.")]
+ProfileFile = Annotated[Path, typer.Argument(metavar="FILE", help="The lens profile.")]
+Aperture = Annotated[float | None, aperture("f-number, for photos that do not record their own.")]
+AnyLens = Annotated[
+    bool, typer.Option("--any-lens", help="Also accept photos that seem to be of a different lens.")
+]
+Channel = Annotated[types.Channel, typer.Option(help="Colour channel.")]
+RADIUS = typer.Option("--r", min=0.0, max=1.0, help="Distance from the centre: 0 centre, 1 corner.")
+ANGLE = typer.Option(
+    "--phi", min=-math.tau, max=math.tau, help="Angle in radians, counter-clockwise from the right."
+)
+Size = Annotated[int, typer.Option(min=3, max=255, callback=odd, help="Side in pixels, an odd number.")]
+Workers = Annotated[int | None, typer.Option("--workers", "-j", min=1, help="Cores to use; default: all.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only errors: no progress and no notes.")]
+Verbose = Annotated[
+    int,
+    typer.Option(
+        "--verbose",
+        "-v",
+        count=True,
+        metavar="",
+        help="Say more; given twice, everything.",
+        show_default=False,
+    ),
+]

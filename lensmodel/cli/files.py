@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from lensmodel.calibration import LensStore
-from lensmodel.cli.ending import UsageError, reason
+from lensmodel.cli.console import UsageError, reason
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.lens import Lens
 from lensmodel.model import LensProfile, load_profile

@@ -17,12 +17,11 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from lensmodel.cli import ending
-from lensmodel.cli.console import Display
-from lensmodel.cli.ending import InterruptedByUser, UsageError
+from lensmodel.cli import console
+from lensmodel.cli.console import Display, InterruptedByUser, UsageError
 from lensmodel.core.errors import LensModelError
 
-ending.workers_ignore_it()
+console.leave_interrupts_to_the_command()
 
 COMMANDS: Final[Mapping[str | None, Mapping[str, tuple[str, str]]]] = {
     None: {
@@ -115,7 +114,7 @@ def configure(
 
 def main() -> None:
     """Run the command; exit 0 done, 1 something failed, 2 wrong usage, 128 + signal interrupted."""
-    ending.install()
+    console.handle_signals()
     try:
         app(prog_name="lensmodel")  # also where `python -m lensmodel` runs it
     except InterruptedByUser as stopped:
@@ -126,9 +125,9 @@ def main() -> None:
         )
     except (LensModelError, OSError) as error:
         where = f"{error.filename}: " if isinstance(error, OSError) and error.filename else ""
-        text, status = where + ending.reason(error), 2 if isinstance(error, UsageError) else 1
+        text, status = where + console.reason(error), 2 if isinstance(error, UsageError) else 1
     except ModuleNotFoundError as error:
-        text, status = ending.remedy(error) or "", 1
+        text, status = console.remedy(error) or "", 1
         if not text:
             raise
     else:

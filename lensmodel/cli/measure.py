@@ -12,9 +12,8 @@ import typer
 from lensmodel import measured as measuring
 from lensmodel.blind.sampling import configured
 from lensmodel.calibration import Admit, Calibration
-from lensmodel.cli import files, options
-from lensmodel.cli.console import Display
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli import console, files
+from lensmodel.cli.console import Display, UsageError
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample, places_of
 from lensmodel.core.types import LensSettings
@@ -28,11 +27,11 @@ def measure(
     kind: Annotated[
         Literal["target", "pair", "points", "edges"], typer.Argument(help="What the photos show.")
     ],
-    photos: options.Photos,
-    profile: options.Profile,
-    aperture: options.Aperture = None,
+    photos: console.Photos,
+    profile: console.Profile,
+    aperture: console.Aperture = None,
     size: Annotated[
-        int, typer.Option(min=9, max=101, callback=options.odd, help="Side of a PSF in pixels, odd.")
+        int, typer.Option(min=9, max=101, callback=console.odd, help="Side of a PSF in pixels, odd.")
     ] = 31,
     replace_blind: Annotated[
         bool,
@@ -40,10 +39,10 @@ def measure(
             "--replace", help="Drop what was learned blindly at the same aperture and focal length."
         ),
     ] = False,
-    any_lens: options.AnyLens = False,
-    json_output: options.Json = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = 0,
+    any_lens: console.AnyLens = False,
+    json_output: console.Json = False,
+    quiet: console.Quiet = False,
+    verbose: console.Verbose = 0,
 ) -> None:
     """Measure the blur of a lens from photos made for the purpose.
 
@@ -144,7 +143,7 @@ def target(
             "to the number of pixels that the page will span in the photo.",
         ),
     ] = USUAL_DETAIL,
-    force: options.Force = False,
+    force: console.Force = False,
 ) -> None:
     """Write the page to print for `lensmodel measure`.
 

@@ -11,9 +11,8 @@ import typer
 
 from lensmodel import quality
 from lensmodel.api import lateral_of
-from lensmodel.cli import files, options
-from lensmodel.cli.console import Display
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli import console, files
+from lensmodel.cli.console import Display, UsageError
 from lensmodel.core.files import to_json, write_atomically
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.psf import rms_width
@@ -33,13 +32,13 @@ from lensmodel.report import (
 from lensmodel.report import export as write_psfs
 from lensmodel.report.lens_report import SensorGeometry
 
-Aperture = Annotated[float | None, options.aperture("f-number; default: the widest that a photo had.")]
+Aperture = Annotated[float | None, console.aperture("f-number; default: the widest that a photo had.")]
 
 FORMS: Final = (".pdf", ".png", ".csv", ".json")
 
 
 def report(
-    profile: options.ProfileFile,
+    profile: console.ProfileFile,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -55,7 +54,7 @@ def report(
         list[Path] | None,
         typer.Option(help="A photo of the lens whose lateral colour is measured; again for more; needs -o."),
     ] = None,
-    force: options.Force = False,
+    force: console.Force = False,
 ) -> None:
     """Say how sharp a lens is, and whether it is centred.
 
@@ -142,19 +141,19 @@ def _written(found: LensReport, form: str) -> bytes:
 
 
 def export(
-    profile: options.ProfileFile,
+    profile: console.ProfileFile,
     output: Annotated[
         Path,
         typer.Option("--output", "-o", help=f"Where to write: a file that ends in .{', .'.join(exporters)}."),
     ],
     aperture: Aperture = None,
-    channel: options.Channel = "g",
+    channel: console.Channel = "g",
     rows: Annotated[int, typer.Option(min=1, max=100, help="Rows of the grid of places.")] = 5,
     cols: Annotated[int, typer.Option(min=1, max=100, help="Columns of the grid of places.")] = 7,
-    r: Annotated[float | None, options.RADIUS] = None,
-    phi: Annotated[float | None, options.ANGLE] = None,
-    size: options.Size = 31,
-    force: options.Force = False,
+    r: Annotated[float | None, console.RADIUS] = None,
+    phi: Annotated[float | None, console.ANGLE] = None,
+    size: console.Size = 31,
+    force: console.Force = False,
 ) -> None:
     """Write PSFs for other programs.
 
@@ -193,13 +192,13 @@ def export(
 
 
 def psf(
-    profile: options.ProfileFile,
-    r: Annotated[float, options.RADIUS] = 0.0,
-    phi: Annotated[float, options.ANGLE] = 0.0,
-    aperture: Annotated[float | None, options.aperture("f-number; default: all together.")] = None,
-    channel: options.Channel = "g",
-    size: options.Size = 55,
-    json_output: options.Json = False,
+    profile: console.ProfileFile,
+    r: Annotated[float, console.RADIUS] = 0.0,
+    phi: Annotated[float, console.ANGLE] = 0.0,
+    aperture: Annotated[float | None, console.aperture("f-number; default: all together.")] = None,
+    channel: console.Channel = "g",
+    size: console.Size = 55,
+    json_output: console.Json = False,
 ) -> None:
     """Show the image of a point of light at one place in the picture.
 

@@ -10,12 +10,11 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
-from lensmodel.measured.edges import SlantedEdges
+from lensmodel.measured.edges import SlantedEdges, print_chart
 from lensmodel.measured.measurer import MeasuredPsf, Measurer, is_measured, samples_of
-from lensmodel.measured.page import DETAILS, PAPERS, TargetPage, print_chart, print_target
 from lensmodel.measured.pair import AperturePair
 from lensmodel.measured.points import Points
-from lensmodel.measured.target import Target
+from lensmodel.measured.target import DETAILS, PAPERS, Target, TargetPage, print_target
 from lensmodel.photo import LinearPhoto, inspect
 
 methods: Final[Registry[Measurer]] = Registry(

@@ -33,9 +33,16 @@ from scipy import fft, ndimage
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, block_means
-from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared
+from lensmodel.measured.measurer import (
+    MeasuredPsf,
+    Measurer,
+    Prepared,
+    Window,
+    window_corners,
+    window_psf,
+    window_terms,
+)
 from lensmodel.measured.registration import CLEAR, Warp, match, matched
-from lensmodel.measured.solve import Window, window_corners, window_psf, window_terms
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import PlaneNoise
 

@@ -28,8 +28,16 @@ from scipy import ndimage, spatial
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
 from lensmodel.core.types import CHANNELS, Channel, StepHook
-from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared, psf_at
-from lensmodel.measured.solve import NEAR_CLIP, Solved, Window, solve
+from lensmodel.measured.measurer import (
+    NEAR_CLIP,
+    MeasuredPsf,
+    Measurer,
+    Prepared,
+    Solved,
+    Window,
+    psf_at,
+    solve,
+)
 from lensmodel.photo import LinearPhoto
 
 # Error that no cell shows of itself (chosen): three times that of one kernel, which may change in the cell

@@ -16,27 +16,40 @@ printed is known, so with a kernel k that is nearly right
 
 is linear in e_j, the light, and c_j, what the lens and its reflections lay over it; q_j are the terms of
 `quadratic`.
+
+The page is band-limited noise with a disc in each corner. Every sample of the noise is drawn on its own, so
+that the page holds all spatial frequencies up to half a cycle a sample equally, in both directions, and says
+the same of the lens everywhere. It has no size of its own: what must fit is the number of samples along its
+long side, about as many as the page takes pixels in the photo. Fewer leave the finest blur unseen; more are
+finer than pixels and lost.
+
+Source of the idea: N. Joshi et al., "PSF estimation using sharp edge prediction", CVPR 2008, section 4;
+M. Delbracio et al., IJCV 96, 2012, section 4, who show that white noise determines a PSF best.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 from typing import ClassVar, Final
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from scipy import fft
+from PIL import Image, ImageDraw, ImageOps
+from scipy import fft, ndimage, signal
 from scipy.signal.windows import tukey
 
-from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.files import atomic
 from lensmodel.core.types import Kernel, StepHook
-from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared
-from lensmodel.measured.page import DETAILS, MEAN, TargetPage
-from lensmodel.measured.registration import CLEAR, Warp, find_marks, homography_of, match, matched
-from lensmodel.measured.solve import (
+from lensmodel.measured.measurer import (
     SMALL,
+    MeasuredPsf,
+    Measurer,
+    Prepared,
     Solved,
     Window,
     quadratic,
@@ -45,7 +58,172 @@ from lensmodel.measured.solve import (
     window_psf,
     window_terms,
 )
+from lensmodel.measured.registration import CLEAR, Warp, find_marks, homography_of, match, matched
 from lensmodel.photo import LinearPhoto
+
+# --- the page ------------------------------------------------------------------------------------
+
+# Printed dots a sample along each axis (chosen): what the printer leaves of it is smooth
+DOTS: Final = 2
+ASPECT: Final = 2**0.5  # Long side over short side, as A4 and A3 have it
+# Samples along the long side that pages are made with; a photo is compared with each of them (chosen:
+# factors of the root of two)
+DETAILS: Final = (1000, 1400, 2000, 2800, 4000, 5600)
+MEAN: Final = 0.5  # reflectance of the noise, halfway between ink, 0, and paper, 1
+# Standard deviation of the noise as a share of the paper's white: 3 of them reach ink and paper
+CONTRAST: Final = 0.17
+_PAGE_SEED: Final = 20120  # any number: printed pages depend on it, so it stays
+# Samples along the long side: 0.07 mm each on the largest paper, about as fine as greys are printed (chosen)
+_LARGEST: Final = 8000
+# Samples along the long side: coarser noise holds no frequency that a lens takes away (chosen)
+_SMALLEST: Final = 200
+
+
+@dataclass(frozen=True)
+class TargetPage:
+    """A page, by the number of its samples along the long side.
+
+    Coordinates of the page are `(y, x)` in samples; (0, 0) is the middle of its top left sample.
+    """
+
+    detail: int  # samples along the long side
+
+    def __post_init__(self) -> None:
+        if not _SMALLEST <= self.detail <= _LARGEST:
+            raise InvalidInputError(
+                f"a page has {_SMALLEST} to {_LARGEST} samples along its long side, not {self.detail}"
+            )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Samples down and across."""
+        return round(self.detail / ASPECT), self.detail
+
+    @property
+    def border(self) -> int:
+        """Width of the white border in samples: printers leave one anyway."""
+        return max(self.detail // 50, 8)
+
+    @property
+    def mark_side(self) -> int:
+        """Side in samples of the white square around a corner's disc."""
+        return self.detail // 16
+
+    @property
+    def mark_radius(self) -> float:
+        """Radius of the discs in samples."""
+        return self.mark_side / 4.0
+
+    @property
+    def marks(self) -> NDArray[np.float64]:
+        """Middles of the discs `(4, 2)`: top left, top right, bottom right, bottom left."""
+        near = self.border + self.mark_side / 2.0 - 0.5
+        top, left = near, near
+        bottom, right = (length - 1 - near for length in self.shape)
+        return np.array([(top, left), (top, right), (bottom, right), (bottom, left)], dtype=np.float64)
+
+    @cached_property
+    def samples(self) -> NDArray[np.float32]:
+        """Reflectance at the samples, noise only, `shape`, ink 0 to paper 1."""
+        rng = np.random.default_rng([_PAGE_SEED, self.detail])
+        noise = MEAN + CONTRAST * rng.standard_normal(self.shape)
+        return np.clip(noise, 0.02, 0.98).astype(np.float32)
+
+    @cached_property
+    def raster(self) -> NDArray[np.float32]:
+        """The printed page, `DOTS` dots a sample; dot `d` lies at sample `d / DOTS`."""
+        fine = self.samples
+        for axis, length in enumerate(self.shape):  # band-limited
+            fine = signal.resample(fine, length * DOTS, axis=axis)
+        fine = np.clip(fine, 0.0, 1.0)
+        height, width = fine.shape
+        rows = np.arange(height, dtype=np.float32)[:, None] / DOTS
+        cols = np.arange(width, dtype=np.float32)[None, :] / DOTS
+        fine[~self._within(rows, cols, self.border - 0.25)] = 1.0
+        for row, col in self.marks:
+            half = self.mark_side / 2.0
+            box = _slice(row, half, height), _slice(col, half, width)
+            fine[box] = 1.0
+            away = np.hypot(rows[box[0]] - row, cols[:, box[1]] - col)
+            # the rim falls over one sample: a step would have frequencies that no pixel resolves
+            fine[box] -= np.clip(self.mark_radius + 0.5 - away, 0.0, 1.0).astype(np.float32)
+        return fine
+
+    @cached_property
+    def _spline(self) -> NDArray[np.float32]:
+        return np.asarray(ndimage.spline_filter(self.raster, order=3, output=np.float32, mode="mirror"))
+
+    def at(self, rows: NDArray[np.floating], cols: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Reflectance at places of the page, in samples; white beyond it."""
+        reflectance = ndimage.map_coordinates(
+            self._spline, np.stack([rows, cols]) * DOTS,
+            order=3, prefilter=False, mode="constant", cval=1.0, output=np.float32,
+        )  # fmt: skip
+        return np.asarray(reflectance, dtype=np.float32)
+
+    def holds_noise(self, rows: NDArray[np.floating], cols: NDArray[np.floating]) -> bool:
+        """Whether noise, and nothing else, lies at all of these places."""
+        if not bool(self._within(rows, cols, self.border + 1.0).all()):
+            return False
+        half = self.mark_side / 2.0 + 1.0
+        return all(
+            not bool(((np.abs(rows - row) < half) & (np.abs(cols - col) < half)).any())
+            for row, col in self.marks
+        )
+
+    def _within(
+        self, rows: NDArray[np.floating], cols: NDArray[np.floating], border: float
+    ) -> NDArray[np.bool_]:
+        """Whether places are as far as a border from the sides of the page."""
+        height, width = self.shape
+        down = (rows > border) & (rows < height - 1 - border)
+        return np.asarray(down & (cols > border) & (cols < width - 1 - border))
+
+
+def _slice(middle: float, half: float, length: int) -> slice:
+    return slice(max(round((middle - half) * DOTS), 0), min(round((middle + half) * DOTS) + 1, length))
+
+
+# Width and height in millimetres, lying (ISO 216, ANSI/ASME Y14.1)
+PAPERS: Final = {
+    "a2": (594.0, 420.0),
+    "a3": (420.0, 297.0),
+    "a4": (297.0, 210.0),
+    "letter": (279.4, 215.9),
+    "tabloid": (431.8, 279.4),
+}
+# Levels of print (chosen): finer than a printer renders; noise does not compress, and more make a large file
+_GREYS: Final = 64
+
+
+def print_target(path: str | Path, page: TargetPage, *, paper: str = "a3") -> None:
+    """Write a page to print on a paper of `PAPERS`, as a PDF file."""
+    path = Path(path)
+    width, height = on_paper(path, paper)
+    name = f"lensmodel target, detail {page.detail}, {paper.upper()}"
+    steps = np.rint(page.raster * (_GREYS - 1)) * (255.0 / (_GREYS - 1))
+    picture = Image.fromarray(np.rint(steps).astype(np.uint8))
+    place = (picture.width // 2, picture.height - page.border * DOTS // 2)
+    words, size = f"{name}: print at full size, grey, unsharpened", max(page.border * DOTS // 2, 10)
+    ImageDraw.Draw(picture).text(place, words, fill=96, font_size=size, anchor="mm")
+    if abs(width / height / ASPECT - 1.0) >= 0.01:  # white at two sides where the paper has another shape
+        wide, high = round(picture.height * width / height), round(picture.width * height / width)
+        picture = ImageOps.pad(picture, (max(wide, picture.width), max(high, picture.height)), color=255)
+    with atomic(path) as file:
+        # at its best JPEG errs by one of 255 levels, a quarter of the distance between two greys
+        picture.save(file, "PDF", resolution=picture.width / (width / 25.4), quality=100, title=name)
+
+
+def on_paper(path: Path, paper: str) -> tuple[float, float]:
+    """Width and height in millimetres of a paper of `PAPERS`, lying; refuse other papers and files."""
+    if path.suffix.lower() != ".pdf":
+        raise InvalidInputError(f"{path.name}: what is to be printed is written as .pdf")
+    if paper not in PAPERS:
+        raise InvalidInputError(f"no paper {paper!r}; known: {', '.join(sorted(PAPERS))}")
+    return PAPERS[paper]
+
+
+# --- its PSFs ------------------------------------------------------------------------------------
 
 FLOOR: Final = 0.02  # error that no window shows of itself: of the models of light, tones and place (chosen)
 # Residuals over the noise above which a window is cut: for noise stated a tenth too low it is not (chosen)

@@ -1,8 +1,8 @@
 """The PSF as one continuous function of place and settings, learned from local samples."""
 
-from lensmodel.model.answer import ModelSettings, PsfAnswer
 from lensmodel.model.lens_model import LensModel, ModelField
 from lensmodel.model.profile import Camera, LensProfile, load_profile, save_profile
+from lensmodel.model.query import ModelSettings, PsfAnswer
 
 __all__ = [
     "Camera",

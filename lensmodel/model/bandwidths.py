@@ -20,7 +20,7 @@ psi is Tukey's biweight; a sample that fits better than the median keeps its wei
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM
-from lensmodel.model import variables as va
-from lensmodel.model.answer import PAPER, ModelSettings
-from lensmodel.model.local_frame import LocalKernels
+from lensmodel.model import query as va
+from lensmodel.model.query import PAPER, ModelSettings
 
 FALLBACK: Final[Mapping[str, float]] = {
     "aperture_stops": 0.5,
@@ -212,11 +211,11 @@ class CrossValidation:
 def cross_validate(
     samples: Sequence[PsfSample],
     settings: ModelSettings,
-    local: LocalKernels,
+    upright: Callable[[NDArray[np.intp]], NDArray[np.float64]],
     where: NDArray[np.float64],
     base: NDArray[np.float64],
 ) -> CrossValidation:
-    """Choose bandwidths by cross-validation, weigh robustly, note held-out errors."""
+    """Choose bandwidths by cross-validation, weigh samples robustly; `upright` gives the kernels of rows."""
     paper = settings.mode == PAPER
     photo = np.unique([s.photo for s in samples], return_inverse=True)[1]
     groups, scale = _held_together(photo, where[:, 5]), va.scales(bandwidths(where, settings))
@@ -229,7 +228,7 @@ def cross_validate(
         return CrossValidation(base, errors, noise)
 
     def held(rows: NDArray[np.intp], weights: NDArray[np.float64]) -> HeldOut:
-        kernels = local.upright(rows).reshape(len(rows), -1)
+        kernels = upright(rows).reshape(len(rows), -1)
         return HeldOut(kernels, where[rows], scale, weights[rows], groups[rows])
 
     def searched_factors(weights: NDArray[np.float64]) -> tuple[float, float]:

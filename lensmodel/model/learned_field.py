@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import KINDS, PatchKind, PsfSample, centred
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies
-from lensmodel.model import variables as va
-from lensmodel.model.answer import Part
+from lensmodel.model import query as va
+from lensmodel.model.query import Part
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, Memory
 
 NEAREST: Final = 256  # samples that a question attends to (chosen: the patches of three photos)

@@ -15,10 +15,9 @@ from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone, zone_of
 from lensmodel.model import camera_bodies
-from lensmodel.model.answer import PAPER, AnsweredBy, ModelSettings, PsfAnswer
 from lensmodel.model.learned_field import LearnedField
+from lensmodel.model.query import PAPER, VARIABLES, AnsweredBy, ModelSettings, PsfAnswer
 from lensmodel.model.regression import Regression
-from lensmodel.model.variables import VARIABLES
 
 _LEAST_ERROR: Final = 0.01  # relative L2 below which no part of an answer is believed (chosen)
 _LISTED: Final = 1e-3  # share of the weight from which on a photo is counted: less shows in no digit (chosen)
@@ -130,7 +129,7 @@ class LensModel:
 
     @property
     def mode(self) -> str:
-        """Which of `answer.MODES` answers."""
+        """Which of `query.MODES` answers."""
         return self.settings.mode
 
     @property

@@ -1,4 +1,6 @@
-"""The portable lens profile: a zip of JSON and npy that opens anywhere and gives the same PSFs.
+"""The portable lens profile, and whether a photo or another lens can be of the same lens.
+
+A profile is a zip of JSON and npy that opens anywhere and gives the same PSFs.
 
 Layout of a `.lensprofile`, format 2::
 
@@ -17,20 +19,23 @@ import json
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.files import atomic
+from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.psf import EncodedPatch, PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model.answer import ModelSettings
 from lensmodel.model.lens_model import LensModel
+from lensmodel.model.query import ModelSettings
+from lensmodel.photo import PhotoMetadata
 
 FORMAT = 2  # raised when samples of before mean nothing to the model any more
 _MAX_BYTES = 1 << 30  # unpacked: against files made to fill the memory
@@ -257,3 +262,114 @@ def sample_of(
         error=entry["error"],
         half_diagonal_px=entry["half_diagonal_px"],
     )
+
+
+# --- which lens it is ----------------------------------------------------------------------------
+
+SAME_FOCAL: Final = 1.19  # ratio of focal lengths that count as one: a quarter of an octave, as of the model
+_COMPACT_MM: Final = (
+    8.0  # focal lengths below are of compacts, whose zooms are one lens (chosen: of fisheyes)
+)
+
+_NAMED: Final[Mapping[str, tuple[Callable[[str | None], str], str]]] = {
+    "serial": (serial_key, "its serial number is {theirs}, that of the lens {ours}"),
+    "model": (name_key, "it is of the {theirs}, and the lens is the {ours}"),
+    "maker": (name_key, "it is of a lens of {theirs}, and this one is of {ours}"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What a photo or a lens says of itself, as far as it is known."""
+
+    names: Mapping[str, str] = field(default_factory=dict)  # maker, model, serial; of a lens also its label
+    cameras: Collection[Camera] = ()  # bodies that it was seen on whose model is known
+    focals_mm: Collection[float] = ()  # of the photos
+
+    @classmethod
+    def of(cls, metadata: PhotoMetadata) -> Identity:
+        """Take from a photo's metadata what tells of its lens and its camera."""
+        lens = metadata.lens
+        names = {"maker": lens.maker, "model": lens.model, "serial": lens.serial}
+        camera = Camera(metadata.camera_maker, metadata.camera_model, metadata.body_serial)
+        return cls(
+            {name: value for name, value in names.items() if value},
+            (camera,) if camera.model else (),
+            (metadata.focal_mm,) if metadata.focal_mm else (),
+        )
+
+    @classmethod
+    def of_profile(cls, profile: LensProfile) -> Identity:
+        """Take what a profile says of its lens and of the photos it was learned from."""
+        focals = {sample.settings.focal_mm for sample in profile.model.samples}
+        return cls(profile.lens, profile.cameras, [focal for focal in focals if focal])
+
+    @property
+    def names_lens(self) -> bool:
+        """Whether there is more than a maker, which says nothing of the lens."""
+        return bool(self.names.get("model") or self.names.get("serial"))
+
+    @property
+    def is_built_in(self) -> bool:
+        """Whether the lens is part of a camera: it names itself after it."""
+        model = name_key(self.names.get("model"))
+        return not self.names.get("serial") and any(
+            key in model for camera in self.cameras if (key := name_key(camera.model))
+        )
+
+
+def difference(lens: Identity, other: Identity) -> str | None:
+    """Say why a photo, or another lens, cannot be, or need not be, of a lens; None where nothing says so.
+
+    - What both name of the lens must agree.
+    - Where only the other names its lens, its camera recorded more than for the photos of the lens, so
+      nothing says that they are of one lens, unless the owner gave the lens a label. A lens of which nothing
+      at all is known may be any.
+    - Where one of them names no lens, its camera must be of a model that both were seen on: the lens of a
+      compact is part of it, and two models of camera have two lenses. On the same body an unnamed lens may be
+      any that was screwed on; its focal length tells that it was another one, but for compacts that zoom.
+    - A lens that is part of a camera, and names itself after it or not at all, is as unique as the body: the
+      serials of both must agree.
+    """
+    for name, (key, words) in _NAMED.items():
+        ours, theirs = lens.names.get(name), other.names.get(name)
+        if ours and theirs and key(ours) != key(theirs):
+            return words.format(theirs=theirs, ours=ours)
+    nothing = not (lens.names or lens.cameras or lens.focals_mm)
+    if other.names_lens and not (lens.names_lens or lens.names.get("label") or nothing):
+        words = " ".join(other.names[name] for name in ("model", "serial") if other.names.get(name))
+        return f"it names its lens, {words}, and the photos of the known lens name none"
+    pairs = list(product(lens.cameras, other.cameras))
+    alike = [(ours, theirs) for ours, theirs in pairs if _same_model(ours, theirs)]
+    unnamed = not (lens.names_lens and other.names_lens)
+    if unnamed and pairs and not alike:
+        return (
+            f"it was taken with another camera, {_models(other)}, and the photos of the known lens with "
+            f"{_models(lens)}, and not both name their lens"
+        )
+    built_in = other.is_built_in if other.names_lens else not lens.names_lens
+    bodies = [{serial_key(pair[k].serial) for pair in alike if pair[k].serial} for k in (0, 1)]
+    if built_in and all(bodies) and not bodies[0] & bodies[1]:
+        return "it was taken with another copy of the camera, and nothing says that the lens is the same"
+    focals = [*lens.focals_mm, *other.focals_mm]
+    if unnamed and lens.focals_mm and other.focals_mm and not (alike and min(focals) < _COMPACT_MM):
+        low, high = min(other.focals_mm), max(other.focals_mm)
+        if low > SAME_FOCAL * max(lens.focals_mm) or high * SAME_FOCAL < min(lens.focals_mm):
+            known = _span(lens.focals_mm)
+            return f"it is of {_span(other.focals_mm)}, and the photos of the known lens of {known}"
+    return None
+
+
+def _same_model(one: Camera, other: Camera) -> bool:
+    # makers write their name into the model or not, and in more than one way; models are not shared
+    a, b = name_key(one.model), name_key(other.model)
+    return bool(a) and bool(b) and (a.endswith(b) or b.endswith(a))
+
+
+def _models(it: Identity) -> str:
+    return ", ".join(sorted({camera.model or "an unknown camera" for camera in it.cameras}))
+
+
+def _span(focals_mm: Collection[float]) -> str:
+    low, high = min(focals_mm), max(focals_mm)
+    return f"{low:g} mm" if low == high else f"{low:g} to {high:g} mm"

@@ -5,11 +5,35 @@ So the sum over all pixels of all samples is one of kernels::
 
     f(u, v) = sum_i W_i C_i(u, v) / sum_i W_i,     W_i = q_i exp(-d_i^2 / 2)
 
-with C_i the sample's kernel in its own radial frame, d_i its distance in bandwidths (`variables`), q_i its
+with C_i the sample's kernel in its own radial frame, d_i its distance in bandwidths (`query`), q_i its
 weight. The samples near a question are found in a kd-tree (paper, section 6.3). Departures from the paper:
 n in eq. (8) counts PSFs, not pixels; the smoothing over (u, v) is that of the spline, because a bandwidth of
 pixels would widen the PSF; unless the mode is "paper", kernels are scaled to the width of the place before
 averaging (`WidthField`).
+
+A mean cross-fades kernels of different widths, which is too wide where the blur grows outwards. Widths are
+smooth and few: the logarithms of the root mean square widths along u and v follow a polynomial of the place::
+
+    log s = b0 + b1 r^2 + b2 r^4 + b3 x + b4 y + b5 x r^2 + b6 y r^2 + b7 (x^2 - y^2) + b8 x y + settings
+
+(third-order theory: coma grows as r, astigmatism and field curvature as r^2; a decentred copy adds odd terms
+in x and y). In the radial frame of a place (u outwards, v along the ring) the kernels of a ring are alike,
+and divided by the width of the place those of all rings nearly are. So sample i is seen from the question
+through the map of pixel offsets::
+
+    M_i = L_i' S_i S^-1 L,      L = [[-sin phi, cos phi], [-cos phi, -sin phi]],   S = diag(s_u, s_v)
+
+A sample is stored once, in its own frame, as a cubic spline S_i on a grid twice as fine as the pixel, and
+resampled once, at the pixels q of an answer (`spline_sums`)::
+
+    f(q) = sum_i w_i |M_i| S_i(M_i (q - shift)),    S(p) = sum_k c_k B3(p_r - k_r) B3(p_c - k_c)
+
+The finer grid is filled by a spline of degree 7: a cubic one of the pixels would be off by 0.7 percent of the
+peak where a Gaussian of 1.1 px is turned by 45 degrees. Kernels so narrow that their spectrum reaches the
+Nyquist frequency ripple between the pixels with a high degree, and are filled with the cubic one.
+
+Source: M. Unser, "Splines: a perfect fit for signal and image processing", IEEE Signal Processing Magazine
+16, 1999.
 """
 
 from __future__ import annotations
@@ -17,6 +41,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -24,13 +49,13 @@ import scipy  # `spatial` is loaded where it is needed: it takes a second
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import NoSamplesError
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.numerics import jit
+from lensmodel.core.psf import PsfSample, resized, second_moments
+from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies
-from lensmodel.model import variables as va
-from lensmodel.model.answer import PAPER, ModelSettings, Part
+from lensmodel.model import query as va
 from lensmodel.model.bandwidths import bandwidths, cross_validate
-from lensmodel.model.local_frame import Answers, LocalKernels, WidthField
+from lensmodel.model.query import PAPER, ModelSettings, Part
 
 _REACH: Final = 5.0  # bandwidths: a Gaussian has fallen to 4e-6 there
 _DROPPED: Final = 3e-5  # samples that together weigh less are left out (chosen: below single precision)
@@ -47,7 +72,7 @@ _WIDEST: Final = 255  # pixels: side of the widest kernel that is made for coars
 class Neighbourhood:
     """Samples by their points and weights, in a kd-tree of the variables that a question knows."""
 
-    points: NDArray[np.float64]  # (n, 7), of `variables`; NaN = unknown
+    points: NDArray[np.float64]  # (n, 7), of `query`; NaN = unknown
     weights: NDArray[np.float64]  # (n,), samples of weight 0 take no part
     scale: NDArray[np.float64]  # (7,), bandwidths
     _trees: dict[tuple[int, ...], scipy.spatial.cKDTree] = field(default_factory=dict)
@@ -101,11 +126,11 @@ class Regression:
         points = va.points(common)
         self._widths = WidthField() if settings.mode == PAPER else WidthField.fit(common, base)
         self._local = LocalKernels.of(common, points, self._widths)
-        self._validation = cross_validate(common, settings, self._local, points, base)
+        self._validation = cross_validate(common, settings, self._local.upright, points, base)
         if self._validation.spoilt:  # that photo has bent the widths too: fit them again without it
             self._widths = WidthField.fit(common, self._validation.weights)
             self._local = replace(self._local, widths=self._widths.over(points))
-            self._validation = cross_validate(common, settings, self._local, points, base)
+            self._validation = cross_validate(common, settings, self._local.upright, points, base)
         self._where = va.all_in_units(common)
         # what the estimators expect of their samples; 0 where they expect nothing
         self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
@@ -169,3 +194,312 @@ class Regression:
     def nbytes(self) -> int:
         """Bytes of stored kernels."""
         return self._local.splines.nbytes
+
+
+# --- kernels in their local frames ---------------------------------------------------------------
+
+# Of 1, r, r^2, then the rest: weak, only against too few samples (chosen)
+_PLACE_RIDGE = np.array([1e-6, 1e-3, 1e-2, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])
+_SETTING_RIDGE = 0.05  # of the settings: with none, two apertures would scale kernels at will (chosen)
+_RANGE = (0.45, 2.5)  # factors by which a kernel is scaled at most: beyond, its shape is another one (chosen)
+_HUBER = 0.15  # of a logarithm of the width: the scatter of estimates (chosen)
+_MIN_SAMPLES = 6  # below, widths are carried nowhere: the fit over the field has more terms (chosen)
+_MOST = 3000  # samples: the cost of the fit grows with them (chosen)
+_ROUNDS = 4  # of reweighting: each costs as much, and later ones change less (chosen)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WidthField:
+    """Widths (s_u, s_v) of the PSF over the field, relative to a reference width of the model."""
+
+    slopes: NDArray[np.float64] | None = None  # (m, 2), of log s_u and log s_v; None = one width everywhere
+    reference: float = 0.0  # logarithm of the width that counts as 1
+    stops: float = 0.0  # origins of the settings, where terms of them are zero
+    focal: float = 0.0
+
+    def over(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Widths along u and v at points `(n, 7)` of `query`, over the reference width, shape (n, 2)."""
+        if self.slopes is None:
+            return np.ones((len(where), 2))
+        # no matrix product: how that rounds hangs on how many places are asked for at once
+        logarithms = (self._features(where)[:, :, None] * self.slopes).sum(axis=1)
+        return np.clip(np.exp(logarithms - self.reference), *_RANGE)
+
+    def _features(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
+        r2 = where[:, 0] ** 2
+        x, y = va.vectors(where).T
+        stops, focal = where[:, 3] - self.stops, where[:, 5] - self.focal
+        stops[np.isnan(stops)] = focal[np.isnan(focal)] = 0.0
+        wave = (where[:, 4] - WAVELENGTH_NM["g"]) / 100.0
+        place = [np.ones_like(r2), r2, r2 * r2, x, y, x * r2, y * r2, x * x - y * y, x * y]
+        return np.stack(
+            [*place, stops, stops * stops, stops * r2, focal, focal * r2, wave, wave * wave], axis=1
+        )
+
+    @classmethod
+    def fit(cls, samples: Sequence[PsfSample], weights: NDArray[np.float64]) -> WidthField:
+        """Fit the widths of weighted samples by Huber's weights; one width everywhere below six samples."""
+        rows = np.flatnonzero(weights > 0)
+        if len(rows) < _MIN_SAMPLES:
+            return cls()
+        if len(rows) > _MOST:
+            rows = rows[np.linspace(0, len(rows) - 1, _MOST).round().astype(np.intp)]
+        samples = [samples[int(i)] for i in rows]
+        where = va.points(samples)
+        known = (column[~np.isnan(column)] for column in (where[:, 3], where[:, 5]))
+        stops, focal = (float(np.median(column)) if column.size else 0.0 for column in known)
+        origin = cls(stops=stops, focal=focal)
+        design = origin._features(where)
+        target = np.array([_log_widths(s) for s in samples])
+        weight = np.maximum(weights[rows], 1e-3)
+        extra = design.shape[1] - len(_PLACE_RIDGE)
+        ridge = np.diag(np.concatenate([_PLACE_RIDGE, np.full(extra, _SETTING_RIDGE)])) * weight.mean()
+        trust = np.ones(len(samples))
+        slopes = np.zeros((design.shape[1], 2))
+        for _ in range(_ROUNDS):
+            weighted = design * (weight * trust)[:, None]
+            slopes = np.linalg.solve(design.T @ weighted + ridge, weighted.T @ target)
+            miss = np.abs(target - design @ slopes).max(axis=1)
+            trust = np.minimum(1.0, _HUBER / np.maximum(miss, 1e-12))
+        seen = design @ slopes
+        reference = float((seen.min() + seen.max()) / 2.0)  # as far from the narrowest as from the widest
+        return cls(slopes, reference, stops, focal)
+
+
+def _log_widths(sample: PsfSample) -> tuple[float, float]:
+    """Logarithms of the root mean square widths along u and v, pixels."""
+    (rr, rc), (_, cc) = second_moments(sample.kernel)
+    c, s = np.cos(sample.position.phi), np.sin(sample.position.phi)
+    # u points to (-sin, cos) and v to (-cos, -sin) in (row, col)
+    uu = s * s * rr - 2 * s * c * rc + c * c * cc
+    vv = c * c * rr + 2 * s * c * rc + s * s * cc
+    return float(0.5 * np.log(max(uu, 0.04))), float(0.5 * np.log(max(vv, 0.04)))
+
+
+FINER = 2  # coefficients for each pixel along an axis; 1 where memory is short
+_MOST_BYTES = 1 << 29  # beyond, kernels are kept no finer than their pixels
+
+# Degrees: near the band limit where light is smooth, short where it is narrow (chosen)
+_SMOOTH, _NARROW = 7, 3
+_ALIASED = (0.05, 0.2)  # contrast at the Nyquist frequency: below, above
+_MARGIN = 8  # pixels: the spline's response has fallen to 3e-5 there
+_RIM = 3  # coefficients around the grid, zeros: so far out a spline is not zero yet
+_LIGHT = 1e-6  # of the peak: fainter pixels do not widen the spline
+_SPLINE_REACH = 2.0 * 2.0**0.5  # of a coefficient, along the diagonal
+_CENTRED_PX = 1e-3  # pixels: a thousandth moves no figure that is reported
+_STEPS = 6  # of centring at most: each lowers what is left many times over (chosen)
+_ROOM = 1.35  # side over that of an answer, for kernels scaled down to it: few are by more (chosen)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answers:
+    """Which samples answer which questions, with which weights."""
+
+    rows: NDArray[np.intp]  # (m,), samples, one question after the other
+    weights: NDArray[np.float64]  # (m,), sum 1 in each question
+    counts: NDArray[np.intp]  # (questions,), samples of each
+
+    def part(self, questions: NDArray[np.intp]) -> Answers:
+        """Return those to some of the questions, which are in ascending order."""
+        kept = np.repeat(np.isin(np.arange(len(self.counts)), questions), self.counts)
+        return Answers(self.rows[kept], self.weights[kept], self.counts[questions])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalKernels:
+    """Splines of the samples with the frames that they belong to."""
+
+    side: int  # odd side of the stored kernels
+    splines: NDArray[np.float32]  # (n, (finer (side - 1) + 1 + 2 rims)^2), coefficients
+    angles: NDArray[np.float64]  # (n,), phi of the places in radians
+    radii: NDArray[np.float64]  # (n,), of the light in steps of the grid
+    widths: NDArray[np.float64]  # (n, 2), scales (s_u, s_v) of the places
+    finer: int = FINER  # coefficients for each pixel along an axis
+
+    @classmethod
+    def of(cls, samples: Sequence[PsfSample], where: NDArray[np.float64], field: WidthField) -> LocalKernels:
+        """Keep samples at points `where` (n, 7)."""
+        side = max(s.kernel.shape[0] for s in samples)
+        finer = FINER if 4 * (FINER * (side - 1) + 1) ** 2 * len(samples) <= _MOST_BYTES else 1
+        stored = np.empty((len(samples), (finer * (side - 1) + 1 + 2 * _RIM) ** 2), dtype=np.float32)
+        radii = np.empty(len(samples))
+        for i, sample in enumerate(samples):
+            spline = coefficients(resized(sample.kernel, side), finer)
+            lit = np.argwhere(np.abs(spline) > _LIGHT * np.abs(spline).max()) - spline.shape[0] // 2
+            stored[i], radii[i] = np.pad(spline, _RIM).ravel(), np.hypot(*lit.T).max() + _SPLINE_REACH
+        angles = np.array([s.position.phi for s in samples])
+        return cls(side, stored, angles, radii, field.over(where), finer)
+
+    def kernels(
+        self, answers: Answers, angles: NDArray[np.float64], widths: NDArray[np.float64], size: int
+    ) -> NDArray[np.float64]:
+        """Means of the neighbours at places of `angles` (q,) and `widths` (q, 2), shape (q, size, size).
+
+        Centring moves the points at which the splines are read: kernels are not resampled again.
+        """
+        shifts = np.zeros((len(angles), 2))
+        light = np.empty((len(angles), size, size))
+        t = np.arange(size, dtype=np.float64) - size // 2
+        left = np.arange(len(angles))
+        for _ in range(_STEPS):
+            kernels = self._sums(answers.part(left), angles[left], widths[left], shifts[left], size)
+            kernels = without_negatives(kernels.reshape(len(left), -1)).reshape(kernels.shape)
+            light[left] = kernels
+            total = kernels.sum(axis=(1, 2))
+            row, col = kernels.sum(axis=2) @ t / total, kernels.sum(axis=1) @ t / total
+            shifts[left] -= np.stack([row, col], axis=1)
+            left = left[np.hypot(row, col) >= _CENTRED_PX]
+            if not left.size:
+                break
+        return np.asarray(light / light.sum(axis=(1, 2), keepdims=True))
+
+    def upright(self, rows: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Kernels at phi = 0 and unit width, rows towards -v, columns towards u, shape (m, side, side)."""
+        count, side = len(rows), 2 * int(np.ceil(self.side // 2 * _ROOM)) + 1
+        single = Answers(rows, np.ones(count), np.ones(count, dtype=np.intp))
+        return self._sums(single, np.zeros(count), np.ones((count, 2)), np.zeros((count, 2)), side)
+
+    def _sums(
+        self,
+        answers: Answers,
+        angles: NDArray[np.float64],
+        widths: NDArray[np.float64],
+        shifts: NDArray[np.float64],
+        size: int,
+    ) -> NDArray[np.float64]:
+        """Weighted sums of the samples of each answer, which may be negative and off the centre."""
+        rows, asked = answers.rows, np.repeat(np.arange(len(angles)), answers.counts)
+        scale = self.widths[rows] / widths[asked]
+        maps = _frames(self.angles[rows]).mT @ ((scale * self.finer)[:, :, None] * _frames(angles[asked]))
+        factors = answers.weights * scale[:, 0] * scale[:, 1]
+        starts = np.concatenate([[0], np.cumsum(answers.counts)])
+        out = np.zeros((len(angles), size, size))
+        spline_sums(self.splines, self.radii, rows, factors, maps, starts, shifts, out)
+        return out
+
+
+def without_negatives(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The nearest values that are not negative and have the same sum, of each row of (q, n).
+
+    They are lower by one amount, or zero. Clipping alone would keep the crests of a spline's ripples round a
+    sharp kernel and drop their troughs. Source: J. Duchi et al., "Efficient projections onto the l1-ball for
+    learning in high dimensions", ICML 2008, fig. 1.
+    """
+    lowered = values.copy()
+    for row in np.flatnonzero((values.min(axis=1) < 0.0) & (values.max(axis=1) > 0.0)):
+        falling, total = np.sort(values[row])[::-1], values[row].sum()
+        excess = np.cumsum(falling) - (total if total > 0.0 else falling[0])
+        count = np.flatnonzero(falling * np.arange(1, falling.size + 1) > excess)[-1] + 1
+        lowered[row] = np.maximum(values[row] - excess[count - 1] / count, 0.0)
+    return lowered
+
+
+def _frames(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """L of each angle: from (row, col) to (u, v), shape (n, 2, 2)."""
+    c, s = np.cos(angles), np.sin(angles)
+    return np.stack([np.stack([-s, c], axis=-1), np.stack([-c, -s], axis=-1)], axis=-2)
+
+
+def coefficients(kernel: NDArray[np.floating], finer: int = FINER) -> NDArray[np.float64]:
+    """Coefficients of the spline through the pixels of a kernel, `(k, k)` to `(finer (k - 1) + 1,) * 2`."""
+    turns = 1.0 - 2.0 * (np.arange(kernel.shape[0]) % 2)
+    contrast = max(abs(float(turns @ kernel.sum(axis=1))), abs(float(turns @ kernel.sum(axis=0))))
+    low, high = _ALIASED
+    narrow = min(max((contrast / float(kernel.sum()) - low) / (high - low), 0.0), 1.0)
+    spline = np.zeros(())
+    for share, degree in ((1.0 - narrow, _SMOOTH), (narrow, _NARROW)):
+        if share > 0:
+            refining = _refining(kernel.shape[0], degree, finer)
+            spline = spline + share * (refining @ kernel @ refining.T)
+    return np.asarray(spline, dtype=np.float64)
+
+
+@lru_cache(maxsize=16)
+def _refining(side: int, degree: int, finer: int) -> NDArray[np.float64]:
+    """Matrix from the pixels of an axis to the coefficients of the finer grid, zeros around both."""
+    half = side // 2
+    fine = np.arange(-half * finer, half * finer + 1)
+    pixels = np.pad(np.eye(side), ((_MARGIN, _MARGIN), (0, 0)))
+    through = scipy.interpolate.make_interp_spline(
+        np.arange(-half - _MARGIN, half + _MARGIN + 1), pixels, k=degree
+    )
+    sampling = (4.0 * np.eye(fine.size) + np.eye(fine.size, k=1) + np.eye(fine.size, k=-1)) / 6.0
+    return np.asarray(np.linalg.inv(sampling) @ through(fine / finer))
+
+
+# Of the cubic B-spline (M. Unser, IEEE Signal Processing Magazine 16, 1999, eq. 4), in single precision.
+_ONE, _HALF = np.float32(1.0), np.float32(0.5)
+_SIXTH, _TWO_THIRDS = np.float32(1.0 / 6.0), np.float32(2.0 / 3.0)
+
+
+@jit
+def _inside(a: float, b: float, c: float, size: int) -> tuple[int, int]:
+    """Integers j in 0..size with a j^2 + 2 b j + c <= 0, as first and last + 1."""
+    root = b * b - a * c
+    if root < 0.0:
+        return 0, 0
+    root = math.sqrt(root)
+    first, last = math.ceil((-b - root) / a), math.floor((-b + root) / a)
+    return max(first, 0), min(last + 1, size)
+
+
+@jit
+def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Weights of the four coefficients round a point that lies `t` beyond the second."""
+    rest = _ONE - t
+    first, last = rest * rest * rest * _SIXTH, t * t * t * _SIXTH
+    second = _TWO_THIRDS - t * t * (_ONE - _HALF * t)
+    return first, second, _ONE - first - second - last, last
+
+
+@jit
+def _value(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
+    """Value of a spline at (y, x); 0 where not all of its coefficients lie on the grid."""
+    if not (1.0 <= y < side - 2 and 1.0 <= x < side - 2):
+        return np.float32(0.0)
+    row, col = int(y), int(x)
+    v0, v1, v2, v3 = _weights(np.float32(y - row))
+    h0, h1, h2, h3 = _weights(np.float32(x - col))
+    p = (row - 1) * side + col - 1
+    q, r, o = p + side, p + 2 * side, p + 3 * side
+    return (
+        v0 * (h0 * spline[p] + h1 * spline[p + 1] + h2 * spline[p + 2] + h3 * spline[p + 3])
+        + v1 * (h0 * spline[q] + h1 * spline[q + 1] + h2 * spline[q + 2] + h3 * spline[q + 3])
+        + v2 * (h0 * spline[r] + h1 * spline[r + 1] + h2 * spline[r + 2] + h3 * spline[r + 3])
+        + v3 * (h0 * spline[o] + h1 * spline[o + 1] + h2 * spline[o + 2] + h3 * spline[o + 3])
+    )
+
+
+@jit
+def spline_sums(
+    rows: NDArray[np.float32],
+    radii: NDArray[np.float64],
+    chosen: NDArray[np.intp],
+    weights: NDArray[np.float64],
+    maps: NDArray[np.float64],
+    starts: NDArray[np.intp],
+    shifts: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """Add weighted sums of splines, read through affine maps, to `out` (answers, size, size).
+
+    `chosen` (m,) are the samples that are read, one answer after the other from `starts` on, with their
+    `weights`, which include the determinants of the `maps` (m, 2, 2), from (row, col) offsets of the answer
+    in pixels to those of the sample in steps of its grid; each answer is moved by its `shifts` in pixels.
+    """
+    side, size = round(math.sqrt(rows.shape[1])), out.shape[1]
+    half, middle = side // 2, size // 2
+    for answer in range(out.shape[0]):
+        left = -middle - shifts[answer, 1]
+        for k in range(starts[answer], starts[answer + 1]):
+            row, weight = chosen[k], weights[k]
+            spline, reach = rows[row], radii[row]
+            dy, dx = maps[k, 0, 1], maps[k, 1, 1]
+            for i in range(size):
+                down = i - middle - shifts[answer, 0]
+                y = maps[k, 0, 0] * down + dy * left
+                x = maps[k, 1, 0] * down + dx * left
+                first, last = _inside(dy * dy + dx * dx, y * dy + x * dx, y * y + x * x - reach * reach, size)
+                y, x = y + half, x + half
+                for j in range(first, last):
+                    out[answer, i, j] += weight * _value(spline, side, y + j * dy, x + j * dx)

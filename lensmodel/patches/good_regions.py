@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.patches.checks import Details
-from lensmodel.patches.windows import Windows
+from lensmodel.patches.windows import Details, Windows
 
 MODEL: Final = Path(__file__).parent / "data" / "good_regions.npz"
 

@@ -13,8 +13,7 @@ from scipy import ndimage
 from lensmodel.core.types import Plane
 
 if TYPE_CHECKING:  # they import this module
-    from lensmodel.patches.checks import Details
-    from lensmodel.patches.windows import Windows
+    from lensmodel.patches.windows import Details, Windows
 
 SMOOTHING_PX: Final = 1.0  # of the Gaussian before every gradient: noise would enter r's denominator
 FLAT_CONSTANT: Final = 0.5  # suppresses flat regions, for intensities of 0..1 (Xu and Jia)

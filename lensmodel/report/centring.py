@@ -35,7 +35,6 @@ from lensmodel.core.psf import WING_LEVEL, PsfSample, rms_width
 from lensmodel.core.types import LensSettings
 from lensmodel.measured import is_measured
 from lensmodel.model import LensModel
-from lensmodel.report.places import direction_in_words
 
 # Field radius at which opposite sides are compared (chosen: the short sides of a 3:2 frame are at 0.83)
 EDGE_R: Final = 0.85
@@ -47,7 +46,16 @@ _COMATIC: Final = 0.15  # third moment over width cubed, in the middle: a shorte
 _UNSURE: Final = 0.4  # sides that may differ by more, error and all, are not called alike (chosen)
 # One sound lens in a hundred is called decentred: rarer, and mild faults would go unnamed (chosen)
 _CHANCE: Final = 0.01
+_DIRECTIONS: Final = (
+    *("right", "upper right", "top", "upper left"),
+    *("left", "lower left", "bottom", "lower right"),
+)
 _Array = NDArray[np.float64]
+
+
+def direction_in_words(phi: float) -> str:
+    """Name the eighth of the picture that an angle points to."""
+    return _DIRECTIONS[round(phi / (math.pi / 4.0)) % 8]
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,7 @@ from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
 from lensmodel.report.centring import EDGE_R, Centring
-from lensmodel.report.lens_report import UNIT_NAMES, ApertureReport, LensReport
-from lensmodel.report.places import DEFAULT_ASPECT, grid
+from lensmodel.report.lens_report import DEFAULT_ASPECT, UNIT_NAMES, ApertureReport, LensReport, grid
 
 _HEAD: Final = (
     *("quantity", "aperture", "channel", "r", "phi", "row", "col", "frequency_c_px", "frequency_lp_mm"),

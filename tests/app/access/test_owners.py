@@ -36,7 +36,7 @@ from app.runtime import supervisor
 from app.runtime.settings import Settings
 from app.store import Store, accounts, tables
 from app.store.owners import ANY_OWNER, now
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli.console import UsageError
 from lensmodel.cli.main import app
 from lensmodel.core.errors import InvalidInputError
 

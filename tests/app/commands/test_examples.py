@@ -39,7 +39,7 @@ from lab.kernels import gaussian
 from lab.lens_test import MARGIN, squares_chart
 from lensmodel.cli.main import OnDemand, app
 from lensmodel.core.types import Frame
-from lensmodel.measured.page import TargetPage
+from lensmodel.measured.target import TargetPage
 from lensmodel.model import save_profile
 
 HERE = Path(__file__).parents[3]

@@ -25,7 +25,7 @@ from app.runtime.settings import Settings
 from app.store import Store
 from app.store.database import upgrade
 from app.store.tables import GarbageRow
-from lensmodel.cli.ending import InterruptedByUser
+from lensmodel.cli.console import InterruptedByUser
 
 FENCED = 70
 

@@ -26,8 +26,8 @@ from app.store.tables import SampleRow
 from lensmodel.core.psf import centroid, rms_width
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings
-from lensmodel.model.answer import PAPER
 from lensmodel.model.profile import Camera, read_profile, write_profile
+from lensmodel.model.query import PAPER
 
 PLACE = "r=0.9&phi=0.59&aperture=1.4"
 

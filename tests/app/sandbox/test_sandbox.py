@@ -30,7 +30,7 @@ from app.runtime.settings import Settings
 from app.sandbox import confine, runner
 from app.sandbox.child import REPORT, Outcome, TaskLimits, outcome_of
 from app.sandbox.runner import MAX_SAID, Budget, Sandbox
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli.console import UsageError
 
 OWN = Path(__file__).parent
 HERE = OWN.parent

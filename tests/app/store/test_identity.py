@@ -12,7 +12,7 @@ from lab.kernels import gaussian
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import Camera, LensModel, LensProfile, load_profile, save_profile
-from lensmodel.model.identity import Identity, difference
+from lensmodel.model.profile import Identity, difference
 
 CANON = {"maker": "Canon", "model": "EF24mm f/1.4L II USM", "serial": "ab-1"}
 ACME = {"maker": "Acme", "model": "Acme 42mm", "serial": "1"}

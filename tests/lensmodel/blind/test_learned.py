@@ -11,7 +11,7 @@ from lensmodel import blind
 from lensmodel.blind.learned import LearnedEstimator
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.types import CHANNELS, Frame, LensSettings, NoiseModel
-from lensmodel.patches.spread import spread_evenly
+from lensmodel.patches.select import spread_evenly
 from lensmodel.photo import Encoding, LinearPhoto, PhotoInfo
 from lensmodel.simulate import demo_scene
 

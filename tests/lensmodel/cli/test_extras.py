@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from lensmodel.cli import ending
+from lensmodel.cli import console
 
 COMMANDS = ["serve", "doctor", "keys list", "calibrate gone.dng --profile new.lensprofile"]
 SERVICE = ["alembic", "dbos", "fastapi", "obstore", "pydantic_settings", "sqlalchemy", "structlog", "uvicorn"]
@@ -56,9 +56,9 @@ def test_commands_on_files_do_without_the_service(ended: dict[str, tuple[int, st
 
 @pytest.mark.parametrize(("module", "where"), [("app", "container image"), ("lab", "source tree")])
 def test_a_command_that_is_no_part_of_the_wheel_says_where_it_runs(module: str, where: str) -> None:
-    assert where in str(ending.remedy(ModuleNotFoundError("no", name=module)))
+    assert where in str(console.remedy(ModuleNotFoundError("no", name=module)))
 
 
 def test_a_module_that_no_extra_brings_is_no_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "app", raising=False)
-    assert ending.remedy(ModuleNotFoundError("no", name="nonsense")) is None
+    assert console.remedy(ModuleNotFoundError("no", name="nonsense")) is None

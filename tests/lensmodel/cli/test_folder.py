@@ -22,8 +22,7 @@ from running import SMALL, lens_of_one_blur, write_photo
 
 from lensmodel.blind.sampling import photo_id
 from lensmodel.cli.console import Bar
-from lensmodel.cli.correct import table_of
-from lensmodel.cli.groups import Shot, groups
+from lensmodel.cli.correct import Shot, groups, table_of
 from lensmodel.model import load_profile, save_profile
 from lensmodel.model.profile import Camera
 from lensmodel.photo.values import LensIdentity, PhotoMetadata

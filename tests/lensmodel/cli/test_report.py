@@ -15,7 +15,7 @@ from scipy import ndimage
 from typer.testing import CliRunner
 
 from lab.kernels import gaussian
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli.console import UsageError
 from lensmodel.cli.main import app
 from lensmodel.cli.report import name_of
 from lensmodel.core.files import from_json

@@ -24,13 +24,11 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centred, resized
 from lensmodel.core.types import Frame, Kernel, LensSettings, NoiseModel, StepHook, ignore_step
 from lensmodel.measured.edges import SlantedEdges, squares_of
-from lensmodel.measured.measurer import Measurer, Prepared, psf_at
-from lensmodel.measured.page import PAPERS, TargetPage
+from lensmodel.measured.measurer import Measurer, Prepared, psf_at, solve
 from lensmodel.measured.pair import AperturePair, diffraction_otf
 from lensmodel.measured.points import Points, find_lights, isolated_lights
 from lensmodel.measured.registration import homography_of, match
-from lensmodel.measured.solve import solve
-from lensmodel.measured.target import PlacedPage, Target
+from lensmodel.measured.target import PAPERS, PlacedPage, Target, TargetPage
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo, PhotoMetadata

@@ -16,11 +16,18 @@ from lab.model_benchmark import pixel_to_local, run_model_benchmark
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, centroid, delta, second_moments
 from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings
-from lensmodel.model import LensModel, ModelSettings, local_frame
-from lensmodel.model import variables as va
-from lensmodel.model.answer import MODES
-from lensmodel.model.local_frame import Answers, LocalKernels, WidthField
-from lensmodel.model.regression import Neighbourhood
+from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model import query as va
+from lensmodel.model.query import MODES
+from lensmodel.model.regression import (
+    Answers,
+    LocalKernels,
+    Neighbourhood,
+    WidthField,
+    coefficients,
+    spline_sums,
+    without_negatives,
+)
 
 SIZE = 21
 GREEN = LensSettings(aperture=2.0)
@@ -155,11 +162,11 @@ def test_long_axis_turns_with_the_place() -> None:
 @pytest.mark.parametrize("finer", [1, 2])
 def test_spline_goes_through_the_pixels(finer: int) -> None:
     kernel = np.random.default_rng(2).random((11, 11))
-    stored = np.pad(local_frame.coefficients(kernel, finer), 3).astype(np.float32).reshape(1, -1)
+    stored = np.pad(coefficients(kernel, finer), 3).astype(np.float32).reshape(1, -1)
     row, whole, at = np.zeros(1, dtype=np.intp), np.array([0, 1]), np.eye(2)[None] * finer
     read = np.zeros((1, 11, 11))
 
-    local_frame.spline_sums(stored, np.full(1, 99.0), row, np.ones(1), at, whole, np.zeros((1, 2)), read)
+    spline_sums(stored, np.full(1, 99.0), row, np.ones(1), at, whole, np.zeros((1, 2)), read)
 
     assert np.abs(read[0] - kernel).max() < 1e-6
 
@@ -168,7 +175,7 @@ def test_values_without_negatives_keep_their_sum_and_those_without_any_stay() ->
     ripples = np.random.default_rng(9).normal(0.3, 1.0, (4, 81))
     ripples[1] = np.abs(ripples[1])
 
-    after = local_frame.without_negatives(ripples)
+    after = without_negatives(ripples)
 
     assert after.min() == 0.0
     assert after.sum(axis=1) == pytest.approx(ripples.sum(axis=1))

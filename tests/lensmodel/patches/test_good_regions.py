@@ -7,9 +7,8 @@ import pytest
 from scipy import ndimage
 
 from lensmodel.core.types import Frame, NoiseModel, Plane, ignore_step
-from lensmodel.patches.checks import Details, details_of
 from lensmodel.patches.good_regions import FEATURES, GoodRegionsSelector, TreeEnsemble, features_of
-from lensmodel.patches.windows import Windows, measure_blocks, windows_of
+from lensmodel.patches.windows import Details, Windows, details_of, measure_blocks, windows_of
 
 SIGMA = 0.004
 NOISE = NoiseModel.white(SIGMA)

@@ -15,9 +15,8 @@ from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError, Unkno
 from lensmodel.core.types import FieldPosition, Frame, NoiseModel, Plane, ignore_step
 from lensmodel.patches import Patch, Reason, Selection, r_map, require_enough, select, selectors
 from lensmodel.patches import windows as blocks
-from lensmodel.patches.checks import look_at, part_of
-from lensmodel.patches.select import EVIDENCE_FLOOR
-from lensmodel.patches.windows import windows_of
+from lensmodel.patches.select import EVIDENCE_FLOOR, part_of
+from lensmodel.patches.windows import look_at, windows_of
 
 NOISE = NoiseModel.white(0.003)
 

@@ -33,8 +33,15 @@ from lensmodel.report import (
     to_csv,
 )
 from lensmodel.report.centring import Asymmetry, Centring
-from lensmodel.report.lens_report import UNKNOWN, SensorGeometry
-from lensmodel.report.places import direction_in_words, grid, half_sides, place_in_words, ring
+from lensmodel.report.lens_report import (
+    UNKNOWN,
+    SensorGeometry,
+    direction_in_words,
+    grid,
+    half_sides,
+    place_in_words,
+    ring,
+)
 from lensmodel.report.plots import charts, pages, to_pdf, to_png
 
 QUICK = ModelSettings(r=0.3, phi=0.8, mode="paper")

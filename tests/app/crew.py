@@ -19,7 +19,7 @@ from sqlalchemy import func, select
 from app.runtime.settings import Settings
 from app.runtime.supervisor import environment
 from app.store import Store
-from app.store.tables import EventRow, PatchRow, PhotoRow, SampleRow
+from app.store.tables import PatchRow, PhotoRow
 
 STAND_INS = Path(__file__).parent / "stand_ins"
 CHANNELS = 3
@@ -100,14 +100,13 @@ def done_patches(store: Store) -> int:
         return session.scalar(select(func.count()).where(PatchRow.state == "done")) or 0
 
 
-def check_counts(store: Store, photos: int) -> None:
-    """Each photo counted exactly once, each patch sampled exactly once."""
-    lens = store.lenses.page("local", before=None, limit=10)[0]
-    with store.database.reading() as session:
-        samples = session.scalar(select(func.count()).select_from(SampleRow))
-        events = session.scalar(select(func.count()).where(EventRow.kind == "photo_added"))
-    each = CELLS * CHANNELS
-    assert states(store) == ["counted"] * photos
-    assert (lens.version, lens.photo_count, lens.sample_count) == (photos, photos, photos * each)
-    assert (samples, events) == (photos * each, photos)
-    assert done_patches(store) == photos * CELLS
+def check_counts(store: Store, photos: int, owner: str = "local") -> None:
+    """Each photo of an owner counted exactly once, each of its patches sampled exactly once."""
+    (lens,) = store.lenses.page(owner, before=None, limit=10)
+    sent = store.photos.page(owner, before=None, limit=100)
+    kinds = [event.kind for event in store.lenses.history(lens)]
+    samples = store.lenses.samples_of(lens.public_id)[1]
+    assert [photo.state for photo in sent] == ["counted"] * photos
+    assert [photo.patches_done for photo in sent] == [CELLS] * photos
+    assert (lens.version, lens.photo_count, kinds) == (photos, photos, ["photo_added"] * photos)
+    assert len(samples) == lens.sample_count == photos * CELLS * CHANNELS

@@ -35,6 +35,13 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+def ready(client: httpx2.Client) -> bool:
+    """Whether a service answers that it is ready."""
+    with contextlib.suppress(httpx2.HTTPError):
+        return client.get("/readyz").status_code == 200
+    return False
+
+
 def environment_of_s3(address: str) -> dict[str, str]:
     return {
         "AWS_ENDPOINT_URL": f"http://{address}",

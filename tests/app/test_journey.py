@@ -9,7 +9,6 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,20 +17,10 @@ import httpx2
 import numpy as np
 import pytest
 import tifffile
-from deadline import Deadline, stretched
+from deadline import stretched, until
 from PIL import Image
-from running import (
-    BRIEF,
-    OWN_ACCOUNT,
-    PATIENCE_S,
-    PROGRAM,
-    SHAPE,
-    SMALL,
-    Service,
-    running,
-    write_photo,
-)
-from servers import free_port
+from running import BRIEF, OWN_ACCOUNT, PATIENCE_S, PROGRAM, SHAPE, SMALL, Service, running, write_photo
+from servers import free_port, ready
 
 import lensmodel
 from lensmodel.core.psf import rms_width
@@ -155,10 +144,7 @@ def killed(service: Service, member: str) -> None:
     os.kill(service.info()[member], signal.SIGKILL)
     assert service.process is not None
     assert service.process.wait(stretched(60)) == (1 if member == "worker_pid" else -signal.SIGKILL)
-    deadline = Deadline(20)
-    while alive(pids) and not deadline.passed():
-        time.sleep(0.1)
-    assert alive(pids) == []
+    until(lambda: not alive(pids), service.log, 20)
     service.start()
 
 
@@ -221,23 +207,15 @@ def test_the_parts_run_alone_for_installations_on_many_machines(tmp_path: Path) 
         for words in (["worker"], ["api", "--port", str(port)])
     ]
     try:
-        deadline = Deadline(PATIENCE_S)
-        ready = None
-        while ready is None or ready.status_code != 200:
-            assert not deadline.passed(), ready
-            time.sleep(0.2)
-            with contextlib.suppress(httpx2.TransportError):
-                ready = httpx2.get(f"http://127.0.0.1:{port}/readyz")
+        with httpx2.Client(base_url=f"http://127.0.0.1:{port}") as client:
+            until(lambda: ready(client), within_s=PATIENCE_S)
         for part in parts:
             part.send_signal(signal.SIGTERM)
-        statuses = [part.wait(stretched(30)) for part in parts]
+        assert [part.wait(stretched(30)) for part in parts] == [0, 0]
     finally:
         for part in parts:
             part.kill()
             part.wait()
-
-    assert ready.json()["status"] == "ready"
-    assert statuses == [0, 0]
 
 
 def test_work_that_a_stop_interrupted_goes_on_at_the_next_start(service: Service, photos: Path) -> None:

@@ -59,19 +59,6 @@ def test_every_square_of_the_chart_is_one_place(chart: tuple[LinearPhoto, tuple[
     assert sum(map(len, groups)) >= 0.95 * 4 * len(squares)
 
 
-def test_an_edge_shows_the_contrast_along_its_own_normal(
-    chart: tuple[LinearPhoto, tuple[Square, ...]],
-) -> None:
-    photo, _ = chart
-
-    errors = [
-        min(edge.response.mtf50, 0.5) / truth(photo, edge.middle, edge.response.normal) - 1.0
-        for edge in chart_edges(photo)[::5]
-    ]
-
-    assert np.quantile(np.abs(errors), 0.9) < 0.1
-
-
 def test_tangential_and_sagittal_are_not_mixed(chart: tuple[LinearPhoto, tuple[Square, ...]]) -> None:
     photo, _ = chart
 

@@ -93,11 +93,6 @@ def test_the_short_name_o_is_where_to_write_in_every_command() -> None:
     assert all(option.help.startswith("Where to write: ") for option in found)
 
 
-def test_an_option_that_does_not_exist_would_be_noticed() -> None:
-    with pytest.raises(typer.TyperException, match="outputs"):
-        COMMANDS["demo"].make_context("demo", ["--outputs", "x"])
-
-
 # --- each example ------------------------------------------------------------------------------
 
 SHORTER = {"calibrate": ["--estimator", "default"]}

@@ -43,9 +43,11 @@ def test_photos_that_wait_for_their_owner_keep_no_others_out(
     for _ in range(5):
         steps.waiting()
 
-    sent = [client.post("/v1/photos", content=TIFF + bytes([k])).status_code for k in range(3)]
+    *sent, refused = (client.post("/v1/photos", content=TIFF + bytes([k])) for k in range(3))
 
-    assert sent == [202, 202, 429]
+    assert [answer.status_code for answer in sent] == [202, 202]
+    assert (refused.status_code, refused.json()["code"]) == (429, "quota_exceeded")
+    assert int(refused.headers["retry-after"]) > 0
 
 
 def pieces(megabytes: int) -> Iterator[bytes]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import random
 import sqlite3
 import subprocess
@@ -15,6 +16,7 @@ from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import psycopg
 import pytest
@@ -209,18 +211,9 @@ def test_errors_of_the_machinery_are_known_from_ours(error: Exception, is_so: bo
     assert is_outage(error) is is_so
 
 
-class Away:
-    """A job that fails so often before it succeeds."""
-
-    def __init__(self, error: Exception, times: int = 10**6) -> None:
-        self.error, self.left, self.runs = error, times, 0
-        self.__name__ = "job"
-
-    def __call__(self, *arguments: object) -> None:
-        self.runs += 1
-        if self.left:
-            self.left -= 1
-            raise self.error
+def away(error: Exception, times: int = 10**6) -> mock.Mock:
+    """Give a job that fails so often before it succeeds."""
+    return mock.Mock(side_effect=itertools.chain(itertools.repeat(error, times), [None]), __name__="job")
 
 
 @pytest.fixture
@@ -235,7 +228,7 @@ def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 def test_pauses_grow_from_a_second_to_a_minute_until_hours_have_passed(pauses: list[float]) -> None:
     with pytest.raises(ConnectionResetError):
-        insist(Away(ConnectionResetError()), 3600.0)
+        insist(away(ConnectionResetError()), 3600.0)
 
     assert 1.0 <= min(pauses) < 2.0
     assert 45.0 < max(pauses) <= 60.0
@@ -247,16 +240,16 @@ def test_pauses_grow_from_a_second_to_a_minute_until_hours_have_passed(pauses: l
 @pytest.mark.parametrize(
     ("job", "runs", "state", "code"),
     [
-        (Away(AWAY, times=9), 10, "inspecting", None),
-        (Away(OSError(errno.ENOSPC, "full")), None, "failed", "outage"),  # after a night
-        (Away(KeyError("a bug"), times=10), 3, "failed", "internal_error"),
+        (away(AWAY, times=9), 10, "inspecting", None),
+        (away(OSError(errno.ENOSPC, "full")), None, "failed", "outage"),  # after a night
+        (away(KeyError("a bug"), times=10), 3, "failed", "internal_error"),
     ],
 )
 def test_a_job_outlasts_an_outage_of_hours_and_a_few_bugs(
     store: Store,
     steps: Steps,
     pauses: list[float],
-    job: Away,
+    job: mock.Mock,
     runs: int | None,
     state: str,
     code: str | None,
@@ -268,21 +261,21 @@ def test_a_job_outlasts_an_outage_of_hours_and_a_few_bugs(
 
     ended = steps.fresh(photo)
     assert (ended.state, ended.error_code) == (state, code)
-    assert job.runs == (runs or len(pauses) + 1)
+    assert job.call_count == (runs or len(pauses) + 1)
     assert sum(pauses) < 13 * 3600
 
 
 def test_reading_ahead_pauses_in_an_outage_but_keeps_to_no_photo_for_ever(
     settings: Settings, steps: Steps, pauses: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    worker, photo, read = Worker(settings), steps.receive(), Away(OSError(errno.EIO, "a bad block"))
+    worker, photo, read = Worker(settings), steps.receive(), away(OSError(errno.EIO, "a bad block"))
     monkeypatch.setattr("app.jobs.worker.read_ahead", read)
     monkeypatch.setattr(worker._store.photos, "unread", lambda: photo)
 
     with pytest.raises(OSError, match="a bad block"):
         worker._read_ahead()
 
-    assert read.runs == len(pauses) + 1
+    assert read.call_count == len(pauses) + 1
     assert 60.0 < sum(pauses) < 180.0
 
 

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 from conftest import Steps
 from crew import CELLS, Crew, check_counts, databases, done_patches, pause, states
-from deadline import Deadline, stretched
+from deadline import stretched, until
 from servers import postgres
 from sqlalchemy import exc, update
 from uploads import receive, send
@@ -83,7 +83,6 @@ def test_blobs_that_cannot_be_deleted_keep_no_others(
 
     monkeypatch.setattr(worker._context.storage, "delete", delete)
     monkeypatch.setattr(worker._store.jobs, "garbage", lambda: [stuck, other])
-
     worker._tidy()
 
     assert store.jobs.garbage(at=datetime.now(UTC) + timedelta(hours=1)) == [stuck]
@@ -116,10 +115,8 @@ def test_a_worker_keeps_its_lease_while_its_engine_starts(
 
     def start(handlers: object) -> None:
         """As on a machine that is busy: the tables of the jobs take longer than a lease."""
-        first, deadline = store.jobs.workers()[0].heartbeat_at, Deadline(180.0)
-        while store.jobs.workers()[0].heartbeat_at == first and not deadline.passed():
-            time.sleep(0.02)
-        beats.append(store.jobs.workers()[0].heartbeat_at > first)
+        first = store.jobs.workers()[0].heartbeat_at
+        beats.append(until(lambda: store.jobs.workers()[0].heartbeat_at > first))
         raise InterruptedByUser(signal.SIGTERM)
 
     monkeypatch.setattr(worker, "_engine", SimpleNamespace(start=start))

@@ -64,17 +64,9 @@ def developed(path: Path, folder: Path) -> Path:
     return folder
 
 
-def a_picture() -> NDArray[np.uint8]:
-    """A picture of 1300 x 700 with a white corner."""
-    scene = np.full((700, 1300, 3), 40, dtype=np.uint8)
-    scene[:20, :20] = 255
-    return scene
-
-
-def held_upright() -> Image.Exif:
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    return exif
+CORNERED = np.full((700, 1300, 3), 40, dtype=np.uint8)
+"""A picture with a white corner."""
+CORNERED[:20, :20] = 255
 
 
 # --- pictures -----------------------------------------------------------------------------------------
@@ -83,7 +75,9 @@ def held_upright() -> Image.Exif:
 def test_a_photo_has_a_thumbnail_before_it_is_developed_and_comes_upright(
     client: TestClient, steps: Steps, storage: Storage, tmp_path: Path
 ) -> None:
-    photo, path = steps.receive(), written(tmp_path / "p.jpg", a_picture(), exif=held_upright())
+    exif = Image.Exif()
+    exif[0x0112] = 6  # held upright
+    photo, path = steps.receive(), written(tmp_path / "p.jpg", CORNERED, exif=exif)
     address = f"/ui/photos/{photo.public_id}"
     thumbnail = f"{address}/thumbnail.jpg"
 
@@ -110,9 +104,9 @@ def test_a_photo_has_a_thumbnail_before_it_is_developed_and_comes_upright(
 def test_every_kind_of_photo_has_a_thumbnail(kind: str, tmp_path: Path) -> None:
     path = tmp_path / f"p.{kind}"
     if kind == "tiff":
-        tifffile.imwrite(path, a_picture().astype(np.uint16) * 257)
+        tifffile.imwrite(path, CORNERED.astype(np.uint16) * 257)
     elif kind == "png":
-        written(path, a_picture())
+        written(path, CORNERED)
     else:
         write_bayer_dng(path, np.full((64, 96), 3000, np.uint16), black=512, white=15512)
 
@@ -141,7 +135,7 @@ def corrected(
     wish = {"photo_id": steps.counted().public_id, "output": {"format": "dng"}}
     made: dict[str, Any] = client.post("/v1/corrections", json=wish).json()
     for name in SIDES.values():
-        write_tiles(tmp_path / name, a_picture())
+        write_tiles(tmp_path / name, CORNERED)
         storage.put(f"corrections/{made['id']}/1-1/{name}", tmp_path / name)
     audit = {
         "zones": {"center": {"tiles": 4, "tiles_held": 1, "held_back": 0.1, "checks": {"re-blur": 0.1}}},
@@ -264,23 +258,15 @@ def test_a_jpeg_that_would_gain_nothing_is_left_soon(tmp_path: Path, ending: str
     scene = np.random.default_rng(2).integers(0, 255, (30, 40, 3), dtype=np.uint8).repeat(24, 0).repeat(24, 1)
     photo = written(tmp_path / f"p{ending}", scene, quality=92)
     kernel = gaussian(15, 0.3**2 * np.eye(2))  # a lens without fault
-    samples = [
-        PsfSample(kernel, FieldPosition(0.1 + 0.15 * k, 1.1 * k - 3.0), LensSettings(channel=channel))
-        for k in range(6)
-        for channel in CHANNELS
-    ]
-    write_samples(tmp_path, samples)
+    places = [FieldPosition(0.1 + 0.15 * k, 1.1 * k - 3.0) for k in range(6)]
+    write_samples(
+        tmp_path, [PsfSample(kernel, at, LensSettings(channel=c)) for at in places for c in CHANNELS]
+    )
     output = {"format": "png8", "color_space": "srgb", "quality": 90}
-    wish = {
-        "developed": str(developed(photo, tmp_path / "developed")),
-        "photo": "p",
-        "lateral": None,
-        "settings": dict.fromkeys(("aperture", "focal_mm", "focus_m")),
-        "bounds": {},
-        "description": "",
-        "params": {"method": "fast", "strength": 1.0, "output": output},
-        "workers": 1,
-    }
+    wish = {"photo": "p", "lateral": None, "bounds": {}, "description": "", "workers": 1}
+    wish |= {"settings": dict.fromkeys(("aperture", "focal_mm", "focus_m"))}
+    wish |= {"params": {"method": "fast", "strength": 1.0, "output": output}}
+    wish |= {"developed": str(developed(photo, tmp_path / "developed"))}
     seen: list[int] = []
 
     done = tasks.correct(wish, tmp_path, lambda step, _: seen.append(step))
@@ -299,17 +285,13 @@ def test_corrections_are_followed_and_fetched_together(client: TestClient, corre
 
     assert "2 corrections" in client.get(f"/batch?ids={ids}").text
     assert "1 of 2 done" in part(client, "batch", ids).text
+    used: set[str] = set()
+    sent, named = ("a.tif", "A.tif", "b.tif", "a.tif"), ["a.tif", "A (2).tif", "b.tif", "a (3).tif"]
+    assert [unused_name(name, used) for name in sent] == named
     with zipfile.ZipFile(io.BytesIO(archive.content)) as files:
         assert {name: files.read(name) for name in files.namelist()} == {"p.dng": b"a"}
     assert client.get(f"/batch.zip?ids={waiting}").status_code == 409
     assert client.get("/batch?ids=gone").status_code == 404
-
-
-def test_files_of_one_name_have_two_in_an_archive() -> None:
-    used: set[str] = set()
-    sent, named = ("a.tif", "A.tif", "b.tif", "a.tif"), ["a.tif", "A (2).tif", "b.tif", "a (3).tif"]
-
-    assert [unused_name(name, used) for name in sent] == named
 
 
 def test_the_layer_of_a_preview_is_sent_in_pieces(
@@ -375,8 +357,7 @@ def test_waiting_photos_are_grouped_by_body_and_focal_length() -> None:
 
     groups = grouped(rows)
 
-    found = [(group.body, group.focal_mm, len(group.photos)) for group in groups]
-    assert found == [(1, 35.0, 2), (1, 50.0, 1), (2, 35.0, 1)]
+    assert [(g.body, g.focal_mm, len(g.photos)) for g in groups] == [(1, 35.0, 2), (1, 50.0, 1), (2, 35.0, 1)]
     assert all(g.needs_aperture for g in groups)
     assert [g.name for g in groups] == [f"Kamera One, body {g.body}, {g.focal_mm:g} mm" for g in groups]
 
@@ -449,14 +430,6 @@ def test_no_lens_is_chosen_beforehand_for_a_photo_that_names_none(client: TestCl
     (chosen,) = re.findall(r'<select name="lens_id" required>(.*?)</select>', page)
     assert re.findall(r'<option value="([^"]*)"', chosen)[0] == ""
     assert chosen.count("<option") == 2  # without the lens whose only photo failed
-
-
-def test_a_photo_that_lacks_only_its_aperture_is_asked_for_nothing_else(
-    client: TestClient, steps: Steps
-) -> None:
-    page = client.get(f"/photos/{steps.waiting(serial='123', aperture=None).public_id}").text
-
-    assert ('name="aperture"' in page, 'name="label"' in page) == (True, False)
 
 
 # --- lenses -------------------------------------------------------------------------------------------
@@ -594,8 +567,8 @@ def test_no_page_asks_the_tables_once_for_each_thing_on_it(client: TestClient, s
 
     event.listen(engine, "before_cursor_execute", note)
     furnish(0)
-    _, before = [[statements(path) for path in paths] for _ in range(2)]
+    _, before = ({path: statements(path) for path in paths} for _ in range(2))
     furnish(10)
 
-    assert dict(zip(paths, map(statements, paths), strict=True)) == dict(zip(paths, before, strict=True))
+    assert {path: statements(path) for path in paths} == before
     event.remove(engine, "before_cursor_execute", note)

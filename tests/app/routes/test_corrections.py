@@ -243,14 +243,3 @@ def test_requests_under_other_words_fill_neither_the_queue_nor_the_table(
     assert "2 corrections are stored, and 2 are allowed: delete some" in full.json()["detail"]
     client.delete(f"/v1/corrections/{made[0]}")
     assert post(client, photo_id=photo, nonce="three").status_code == 202
-
-
-def test_nothing_is_corrected_where_the_disk_is_full(
-    client: TestClient, photo: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    storage = client.app.state.services.storage  # type: ignore[attr-defined] # Starlette's own attribute
-    monkeypatch.setattr(storage, "free_bytes", lambda: (settings.min_free_mb << 20) - 1)
-
-    answer = post(client, photo_id=photo)
-
-    assert (answer.status_code, answer.json()["code"]) == (507, "quota_exceeded")

@@ -369,22 +369,6 @@ def other(steps: Steps) -> str:
     return steps.named(LensName(None, None, None, label="Another"))
 
 
-def test_several_photos_are_named_at_once_or_none(client: TestClient, steps: Steps, learned: str) -> None:
-    photos = [steps.waiting() for _ in range(3)]
-    keys = [photo.public_id for photo in photos]
-
-    gone = client.patch("/v1/photos", json={"photo_ids": [keys[0], "gone"], "lens_id": learned})
-    assert refusal(gone) == (404, "unknown_photo")
-    assert "lens_id" not in steps.fresh(photos[0]).given
-    change = {"photo_ids": keys, "new_lens": {"label": "Mine"}, "aperture": 2.0}
-    named = client.patch("/v1/photos", json=change)
-
-    assert named.status_code == 200, named.text
-    rows = [steps.fresh(photo) for photo in photos]
-    assert len({row.given["lens_id"] for row in rows}) == 1
-    assert {(row.given["aperture"], row.state) for row in rows} == {(2.0, "received")}
-
-
 @pytest.mark.usefixtures("reading")
 def test_a_profile_goes_out_and_comes_back_once(
     client: TestClient, learned: str, other: str, profile: bytes

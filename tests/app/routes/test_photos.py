@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -45,27 +46,19 @@ def change(client: TestClient, photo: Any, **said: Any) -> Any:
     return client.patch(f"/v1/photos/{photo.public_id}", json=said)
 
 
-Noted = Callable[[Callable[[], object]], list[str]]
+def after_first_read(patch: pytest.MonkeyPatch, change: Callable[[], object] = lambda: None) -> list[str]:
+    """Let a change happen when a watching request has read its job once; return the list of what it reads."""
+    find, reads = jobs.find_job, list[str]()
 
+    def find_then_change(call: Call, job_id: str) -> JobOut:
+        job = find(call, job_id)
+        reads.append(job_id)
+        if len(reads) == 1:
+            change()
+        return job
 
-@pytest.fixture
-def after_first_read(monkeypatch: pytest.MonkeyPatch) -> Noted:
-    """Let a change happen when the watching request has read the job once, and note what it reads."""
-
-    def arrange(change: Callable[[], object]) -> list[str]:
-        find, pending, reads = jobs.find_job, [change], list[str]()
-
-        def find_then_change(call: Call, job_id: str) -> JobOut:
-            job = find(call, job_id)
-            reads.append(job_id)
-            if pending:
-                pending.pop()()
-            return job
-
-        monkeypatch.setattr(jobs, "find_job", find_then_change)
-        return reads
-
-    return arrange
+    patch.setattr(jobs, "find_job", find_then_change)
+    return reads
 
 
 def test_a_counted_photo_shows_its_lens_and_patches_and_no_serial(client: TestClient, steps: Steps) -> None:
@@ -79,10 +72,8 @@ def test_a_counted_photo_shows_its_lens_and_patches_and_no_serial(client: TestCl
     assert (shown["width"], shown["focal_length_mm"], shown["pixel_pitch_um"]) == (6000, 24.0, 6.0)
     assert "SECRET-77" not in str((shown, get(client, f"jobs/{photo.public_id}")))
     patches = get(client, f"photos/{photo.public_id}/patches")["items"]
-    assert [(patch["state"], patch["reason"]) for patch in patches] == [
-        *[("done", None)] * 2,
-        ("rejected", "flat"),
-    ]
+    told = [(patch["state"], patch["reason"]) for patch in patches]
+    assert told == [("done", None), ("done", None), ("rejected", "flat")]
 
 
 def test_photos_are_listed_by_lens_and_state(client: TestClient, steps: Steps) -> None:
@@ -211,10 +202,12 @@ def test_a_job_tells_how_far_it_is(client: TestClient, steps: Steps) -> None:
 
 
 def test_a_waiting_request_answers_at_the_change(
-    client: TestClient, steps: Steps, store: Store, after_first_read: Noted
+    client: TestClient, steps: Steps, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo = steps.receive()
-    after_first_read(lambda: store.photos.set_state(photo.public_id, ("received",), "inspecting"))
+    after_first_read(
+        monkeypatch, lambda: store.photos.set_state(photo.public_id, ("received",), "inspecting")
+    )
     began = time.monotonic()
 
     job = get(client, f"jobs/{photo.public_id}?wait=10")
@@ -224,25 +217,28 @@ def test_a_waiting_request_answers_at_the_change(
 
 
 def test_a_finished_job_does_not_make_anybody_wait(
-    client: TestClient, steps: Steps, monkeypatch: pytest.MonkeyPatch, after_first_read: Noted
+    client: TestClient, steps: Steps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    photo, reads = steps.counted(), after_first_read(lambda: None)
+    photo, reads = steps.counted(), after_first_read(monkeypatch)
     monkeypatch.setattr(jobs, "LOOK_S", 60.0)
 
     assert get(client, f"jobs/{photo.public_id}?wait=20")["state"] == "succeeded"
     assert reads == [photo.public_id]
 
 
-def test_events_send_each_state_until_the_end_and_nothing_ends_twice(
-    client: TestClient, steps: Steps, store: Store, after_first_read: Noted
+def test_events_send_each_state_once_until_the_end_which_who_comes_again_is_told_alone(
+    client: TestClient, steps: Steps, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = f"/v1/jobs/{(photo := steps.receive()).public_id}"
-    after_first_read(lambda: store.photos.cancel(photo.public_id, ANY_OWNER))
+    after_first_read(monkeypatch, lambda: store.photos.cancel(photo.public_id, ANY_OWNER))
 
-    lines = client.get(f"{path}/events").text.splitlines()
+    told = [client.get(f"{path}/events").text for _ in range(2)]
 
-    events = [json.loads(line.removeprefix("data: ")) for line in lines if line.startswith("data: ")]
-    assert [event["state"] for event in events] == ["queued", "cancelled"]
+    events = [
+        [json.loads(data)["state"] for data in re.findall(r"^data: (.*)$", text, re.MULTILINE)]
+        for text in told
+    ]
+    assert events == [["queued", "cancelled"], ["cancelled"]]
     assert refusal(client.post(f"{path}/cancel")) == (409, "conflict")
     other = client.post(f"/v1/jobs/{steps.receive().public_id}/cancel")
     assert (other.status_code, other.json()["state"]) == (202, "cancelled")

@@ -18,9 +18,9 @@ from unittest import mock
 
 import httpx2
 import pytest
-from crew import CELLS, CHANNELS, WORKER, quick, states
+from crew import WORKER, check_counts, quick, states
 from deadline import stretched, until
-from servers import missing, moto, postgres
+from servers import missing, moto, postgres, ready
 from sqlalchemy import select, text
 
 from app.blobs.storage import Storage
@@ -70,14 +70,16 @@ class Host:
         self.data.mkdir()
         self.processes: list[subprocess.Popen[bytes]] = []
         far = f"{self.cable}b"
-        ip(f"netns add {self.name}")
-        ip(f"link add {self.cable} type veth peer name {far}")
-        ip(f"link set {far} netns {self.name}")
-        ip(f"addr add {self.gateway}/30 dev {self.cable}")
-        ip(f"link set {self.cable} up")
-        ip(f"-n {self.name} addr add {self.address}/30 dev {far}")
-        ip(f"-n {self.name} link set {far} up")
-        ip(f"-n {self.name} link set lo up")
+        for words in (
+            f"netns add {self.name}",
+            f"link add {self.cable} type veth peer name {far} netns {self.name}",
+            f"addr add {self.gateway}/30 dev {self.cable}",
+            f"link set {self.cable} up",
+            f"-n {self.name} addr add {self.address}/30 dev {far}",
+            f"-n {self.name} link set {far} up",
+            f"-n {self.name} link set lo up",
+        ):
+            ip(words)
 
     def run(self, words: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
         command = ["ip", "netns", "exec", self.name, *words]
@@ -85,11 +87,8 @@ class Host:
             self.processes.append(subprocess.Popen(command, env=environment, stderr=log))
         return self.processes[-1]
 
-    def cut_off(self) -> None:
-        ip(f"link set {self.cable} down")
-
-    def reconnect(self) -> None:
-        ip(f"link set {self.cable} up")
+    def set_cable(self, state: str) -> None:
+        ip(f"link set {self.cable} {state}")
 
     def close(self) -> None:
         for process in self.processes:
@@ -105,12 +104,10 @@ def hosts(tmp_path: Path) -> Iterator[list[Host]]:
     if os.geteuid() != 0 or shutil.which("ip") is None:
         missing("hosts need root and iproute2")
     with contextlib.ExitStack() as stack:
-        made: list[Host] = []
-        for number in (1, 2):
-            try:
-                made.append(stack.enter_context(contextlib.closing(Host(number, tmp_path))))
-            except subprocess.CalledProcessError as error:
-                missing(f"network namespaces cannot be made here: {error.stderr[:200]}")
+        try:
+            made = [stack.enter_context(contextlib.closing(Host(number, tmp_path))) for number in (1, 2)]
+        except subprocess.CalledProcessError as error:
+            missing(f"network namespaces cannot be made here: {error.stderr[:200]}")
         yield made
 
 
@@ -152,12 +149,6 @@ class Site:
         return answer.json()
 
 
-def ready(client: httpx2.Client) -> bool:
-    with contextlib.suppress(httpx2.HTTPError):
-        return client.get("/readyz").status_code == 200
-    return False
-
-
 @pytest.fixture
 def site(hosts: list[Host], tmp_path: Path) -> Iterator[Site]:
     with contextlib.ExitStack() as stack:
@@ -170,18 +161,10 @@ def site(hosts: list[Host], tmp_path: Path) -> Iterator[Site]:
         made = Site(store, here, hosts)
         for host, client in zip(hosts, made.clients, strict=True):
             stack.enter_context(client)
-            environment = {
-                **ENVIRONMENT,
-                **{f"LENS_{name.upper()}": str(value) for name, value in SETTINGS.items()},
-                **s3.environment(host.gateway),
-                **quick(ENVIRONMENT),
-                "LENS_DATA_DIR": str(host.data),
-                "LENS_DATABASE_URL": server.url("app", host.gateway),
-                "LENS_HOST": host.address,
-                "LENS_PORT": str(API_PORT),
-                "LENS_SANDBOX": "try",  # whatever this machine has
-                "LENS_ALLOWED_HOSTS": "localhost",
-            }
+            own = {"data_dir": host.data, "database_url": server.url("app", host.gateway), "port": API_PORT}
+            own |= {"host": host.address, "sandbox": "try", "allowed_hosts": "localhost"}
+            ours = {f"LENS_{name.upper()}": str(value) for name, value in (SETTINGS | own).items()}
+            environment = {**ENVIRONMENT, **ours, **s3.environment(host.gateway), **quick(ENVIRONMENT)}
             host.run([sys.executable, "-m", "lensmodel", "api"], environment)
             made.workers.append(host.run(WORKER, environment))
         until(made.all_run, within_s=PATIENCE_S)
@@ -196,21 +179,18 @@ def test_two_hosts_share_the_photos_and_one_may_be_cut_off_and_return(site: Site
 
     sent = [site.send(number % 2, number) for number in range(1, 9)]
     until(lambda: site.are_counted(2), log, PATIENCE_S)
-    site.hosts[1].cut_off()
+    site.hosts[1].set_cable("down")
     until(site.are_counted, log, PATIENCE_S)  # the other one finishes all
     alone = len(site.store.jobs.live(LEASE_S))
-    site.hosts[1].reconnect()
+    site.hosts[1].set_cable("up")
     until(lambda: site.workers[1].poll() is not None, log, PATIENCE_S)  # late: it must not go on
 
-    photos = 1 + len(sent)
     assert len(site.makers()) == 2  # both have worked
     assert alone == 1
     assert site.workers[1].returncode == FENCED
     assert site.workers[0].poll() is None
     until(lambda: ready(site.clients[1]), site.hosts[1].log, PATIENCE_S)  # its API is of use again
-    (lens,) = site.store.lenses.page("local", before=None, limit=2)
-    assert (lens.version, lens.photo_count) == (photos, photos)
-    assert lens.sample_count == photos * CELLS * CHANNELS
+    check_counts(site.store, 1 + len(sent))
     assert examine(site.settings, site.store, Storage(site.settings.storage)) == []
 
 
@@ -237,7 +217,7 @@ def test_what_a_host_has_locked_is_free_again_once_it_was_cut_off(hosts: list[Ho
         hosts[0].run([sys.executable, "-c", HOLDS, url, str(held)], ENVIRONMENT)
         until(held.exists, hosts[0].log, PATIENCE_S)
 
-        hosts[0].cut_off()
+        hosts[0].set_cable("down")
         with database.writing() as session:
             session.execute(text(f"SET LOCAL lock_timeout = '{stretched(PATIENCE_S):.0f}s'"))
             assert session.connection().execute(text("UPDATE owner SET name = name")).rowcount == 1

@@ -8,6 +8,7 @@ import json
 import logging
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
 
 import httpx2
 import pytest
@@ -39,29 +40,24 @@ def as_before() -> Iterator[None]:
 
 
 @pytest.fixture
-def lines(as_before: None) -> io.StringIO:
-    """Let every record of the service be written as JSON into a text."""
+def said(as_before: None) -> Said:
+    """Let every record of the service be written as a line of JSON; return those of a logger."""
     written = io.StringIO()
     handler = logging.StreamHandler(written)
     handler.setFormatter(logs.one_object("test"))
     logging.getLogger().addHandler(handler)
     logging.getLogger("app").setLevel(logging.INFO)
     logging.getLogger("app.access").setLevel(logging.NOTSET)
-    return written
-
-
-@pytest.fixture
-def said(lines: io.StringIO) -> Said:
-    """Return the records of a logger."""
 
     def read(logger: str) -> list[dict[str, Any]]:
-        records = map(json.loads, lines.getvalue().splitlines())
+        assert "\x1b" not in written.getvalue()
+        records = map(json.loads, written.getvalue().splitlines())
         return [record for record in records if record["logger"] == logger]
 
     return read
 
 
-def test_a_record_is_one_object_on_one_line_whatever_it_holds(lines: io.StringIO, said: Said) -> None:
+def test_a_record_is_one_object_on_one_line_whatever_it_holds(said: Said) -> None:
     try:
         int("12\n\x1b[2J")
     except ValueError:
@@ -72,7 +68,6 @@ def test_a_record_is_one_object_on_one_line_whatever_it_holds(lines: io.StringIO
     assert record["message"] == "two\nlines of a \x1b[31mstranger\u2028"
     assert (record["level"], record["part"]) == ("error", "test")
     assert "ValueError" in record["exception"]
-    assert "\x1b" not in lines.getvalue()
     assert record["time"].endswith("Z")
 
 
@@ -166,9 +161,12 @@ def test_depth_and_age_of_the_queue_are_those_of_the_tables(client: TestClient, 
 
     values = asked(client)
 
-    assert values["lensmodel_queue_jobs{'kind': 'photo', 'state': 'received'}"] == 1
-    assert values["lensmodel_queue_jobs{'kind': 'photo', 'state': 'inspecting'}"] == 1
-    assert values["lensmodel_queue_jobs{'kind': 'correction', 'state': 'queued'}"] == 0
+    for kind, state, jobs in (
+        ("photo", "received", 1),
+        ("photo", "inspecting", 1),
+        ("correction", "queued", 0),
+    ):
+        assert values[f"lensmodel_queue_jobs{{'kind': '{kind}', 'state': '{state}'}}"] == jobs
     assert 0 < values["lensmodel_queue_oldest_seconds{'kind': 'photo'}"] < 60
     assert values["lensmodel_workers{}"] == 0
 
@@ -197,15 +195,9 @@ def test_requests_and_psf_queries_are_counted_by_route_and_never_by_id(
 
 def test_a_worker_tells_its_own_where_it_has_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.jobs.queue.sleep", lambda _: None)
-    failures = iter([OutageError(), *[KeyError()] * 3])
-
-    def fail(*_: object) -> None:
-        error = next(failures, None)
-        if error is not None:
-            raise error
-
-    durable("photo", fail, lambda *_: None)("p", 1)
-    durable("photo", fail, lambda *_: None)("p", 1)
+    fails = mock.Mock(side_effect=[OutageError(), *[KeyError()] * 3, None], __name__="job")
+    for _ in range(2):
+        durable("photo", fails, lambda *_: None)("p", 1)
     address = f"127.0.0.1:{free_port()}"
 
     metrics.publish(address)

@@ -14,9 +14,9 @@ import socket
 import struct
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -63,11 +63,10 @@ def spawn(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> No
 
 def open_files(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> int:
     held = []
-    try:
+    with contextlib.suppress(OSError):
         while True:
             held.append((folder / "a").open("w"))
-    except OSError:
-        return len(held)
+    return len(held)
 
 
 class _Full(io.RawIOBase):
@@ -87,67 +86,45 @@ def fill_the_disk(arguments: dict[str, Any], folder: Path, progress: ProgressHoo
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def probe(  # noqa: C901 - one try each
-    arguments: dict[str, Any], folder: Path, progress: ProgressHook
-) -> dict[str, str]:
+def probe(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, str]:
     """Try what a task that a hostile file took over would try; say how far each came."""
 
-    def connect() -> str:
-        with socket.create_connection(("127.0.0.1", arguments["port"]), timeout=5):
-            return "connected"
-
-    def speak_up() -> str:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-            return str(opened.sendto(b"x", ("127.0.0.1", arguments["port"])))
-
-    def fork() -> str:
+    def fork() -> None:
         pid = os.fork()
         if pid == 0:
             os._exit(0)
         os.waitpid(pid, 0)
-        return "forked"
 
-    def trace() -> str:
+    def trace() -> None:
         if ctypes.CDLL(None, use_errno=True).ptrace(16, arguments["parent"], 0, 0) < 0:
             raise OSError(ctypes.get_errno(), "ptrace")
-        return "attached"
 
-    def signal_the_parent() -> str:
-        os.kill(arguments["parent"], 0)
-        return "signalled"
-
-    def thread() -> str:
-        said: list[str] = []
-        started = threading.Thread(target=said.append, args=("ran",))
-        started.start()
-        started.join()
-        return said[0]
-
-    parent = Path(f"/proc/{arguments['parent']}")
+    parent, service = Path(f"/proc/{arguments['parent']}"), ("127.0.0.1", arguments["port"])
+    database, other = Path(arguments["database"]), Path(arguments["other"])
     tries: dict[str, Callable[[], object]] = {
         "own environment": lambda: Path("/proc/self/environ").read_text(),
         "environment of the service": (parent / "environ").read_text,
         "memory of the service": lambda: (parent / "mem").open("rb").close(),
         "files of the service": lambda: list((parent / "fd").iterdir()),
-        "database": lambda: Path(arguments["database"]).read_bytes(),
-        "photo of another": lambda: Path(arguments["other"]).read_bytes(),
-        "list of photos": lambda: list(Path(arguments["other"]).parent.iterdir()),
-        "accounts of the machine": lambda: Path("/etc/passwd").read_text(),
-        "write to the data": lambda: Path(arguments["database"]).write_bytes(b"gone"),
-        "make a file": lambda: Path(arguments["database"]).with_name("planted").touch(),
+        "database": database.read_bytes,
+        "photo of another": other.read_bytes,
+        "list of photos": lambda: list(other.parent.iterdir()),
+        "accounts of the machine": Path("/etc/passwd").read_text,
+        "write to the data": lambda: database.write_bytes(b"gone"),
+        "make a file": database.with_name("planted").touch,
         "change the cache": (Path(arguments["cache"]) / "planted").touch,
-        "remove a photo": lambda: Path(arguments["other"]).unlink(),
-        "connect": connect,
-        "send a datagram": speak_up,
+        "remove a photo": other.unlink,
+        "connect": lambda: socket.create_connection(service, timeout=5).close(),
+        "send a datagram": lambda: socket.socket(type=socket.SOCK_DGRAM).sendto(b"x", service),
         "fork": fork,
         "run a program": lambda: subprocess.run(["/bin/true"], check=True).returncode,
         "become another program": lambda: os.execv("/bin/true", ["/bin/true"]),
         "trace the service": trace,
-        "signal the service": signal_the_parent,
+        "signal the service": lambda: os.kill(arguments["parent"], 0),
         # what it must be able to do
-        "own photo": lambda: Path(arguments["own"]).read_text(),
+        "own photo": Path(arguments["own"]).read_text,
         "own folder": lambda: (folder / "made").write_text("made"),
-        "thread": thread,
+        "thread": lambda: ThreadPoolExecutor(1).submit(str).result(),
         "import": lambda: importlib.import_module("scipy.interpolate").__name__,
     }
     found = {}
@@ -261,14 +238,13 @@ def compile_one(arguments: dict[str, Any], folder: Path, progress: ProgressHook)
 
     twice = jit(_twice)
     twice(1)
-    found = []
-    for what, attempt in (
-        ("reads", lambda p: list(p.iterdir())),
-        ("plants", lambda p: (p / "x").touch()),
-    ):
-        with contextlib.suppress(OSError):
-            attempt(Path(arguments["cache"]))
-            found.append(what)
+    found, cache = [], Path(arguments["cache"])
+    with contextlib.suppress(OSError):
+        list(cache.iterdir())
+        found.append("reads")
+    with contextlib.suppress(OSError):
+        (cache / "x").touch()
+        found.append("plants")
     loaded = "loaded" if twice.stats.cache_hits else "compiled"  # type: ignore[attr-defined]  # a dispatcher
     return [loaded, *found]
 

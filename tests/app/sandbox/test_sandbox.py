@@ -74,10 +74,9 @@ def test_a_task_hands_over_json_and_files_and_sees_nothing_of_the_services_envir
     monkeypatch.setenv("LENS_DATABASE_URL", "postgresql://user:secret@host/db")
     seen: list[tuple[int, ...]] = []
     numbers: Any = {"a": [1, 2], "b": [10, 20]}
+    options: Any = {"limits": LIMITS, "on_progress": lambda *step: seen.append(step)}
     with sandbox.folder() as folder:
-        outcome = sandbox.run(
-            "add", numbers, folder=folder, limits=LIMITS, on_progress=lambda *step: seen.append(step)
-        )
+        outcome = sandbox.run("add", numbers, folder=folder, **options)
 
         assert outcome.ending == "ok"
         assert np.load(folder / "sum.npy", allow_pickle=False).tolist() == [11, 22]

@@ -429,8 +429,7 @@ def test_page_shows_every_way_lens_and_refusal_and_needs_nothing_from_outside(tm
 
 
 def test_json_holds_results_summary_and_bars(tmp_path: Path) -> None:
-    path = write_json(result((160, 32.0)), tmp_path / "all.json")
-    stored = json.loads(path.read_text(encoding="utf-8"))
+    stored = json.loads(write_json(result((160, 32.0)), tmp_path / "all.json").read_text(encoding="utf-8"))
     assert stored["summary"]["third order"]["share"]["1"]["corner"] == pytest.approx(0.6)
     assert stored["cases"][0]["states"]["n = 1"]["psnr"]["mid"] == 32.0
     assert stored["bars_held"] == held(bars(result((160, 32.0))))
@@ -562,8 +561,7 @@ def reproduced(folder: Path, chosen: Reproduction) -> dict[str, Any]:
 
 
 def test_second_run_computes_nothing(tmp_path: Path, quick_photos: list[str]) -> None:
-    chosen = plan(case(photos=(1, 2)))
-    first = reproduced(tmp_path, chosen)
+    first = reproduced(tmp_path, chosen := plan(case(photos=(1, 2))))
     (one,) = first["cases"]
     assert one["states"]["n = 1"] == one["states"][BEFORE]  # nothing was learned
     assert one["refused"]["n = 1"] == ["photo-00: too dark"]

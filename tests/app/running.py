@@ -65,11 +65,8 @@ class Service:
     def __init__(self, data: Path, program: Sequence[str] = PROGRAM, **settings: str) -> None:
         self.data, self._program = data, program
         self.log = data.parent / f"{data.name}.log"
-        self._environment = {
-            **{name: value for name, value in os.environ.items() if not name.startswith("LENS_")},
-            **SETTINGS,
-            **settings,
-        }
+        others = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
+        self._environment = {**others, **SETTINGS, **settings}
         self.process: subprocess.Popen[str] | None = None
         self.http = httpx2.Client(timeout=stretched(60.0))
 
@@ -131,7 +128,7 @@ class Service:
                 return job
             assert job["state"] not in FINAL, f"ended before what was awaited: {job}"
             assert not deadline.passed(), f"{job}\n{self.log.read_text()[-4000:]}"
-            time.sleep(0.25 if until is None else 0.1)
+            time.sleep(0.1)
 
     def calibrated(self, path: Path, **fields: str) -> dict[str, Any]:
         """Send a photo and wait until it counts; return it."""
@@ -215,12 +212,8 @@ def write_light(
     rng = np.random.default_rng(seed)
     electrons = rng.poisson(light * 20000.0)
     mosaic = np.clip(512 + electrons / 20000.0 * 15000.0, 0, 16383).round().astype(np.uint16)
-    metadata = PhotoMetadata(
-        camera_maker="Test",
-        camera_model="T-1",
-        lens=LensIdentity("Test Optics", "Test 35mm f/1.8", serial or None, "exif" if serial else "none"),
-        aperture=aperture,
-        focal_mm=35.0,
-    )
+    lens = LensIdentity("Test Optics", "Test 35mm f/1.8", serial or None, "exif" if serial else "none")
+    seen: dict[str, Any] = {"lens": lens, "aperture": aperture, "focal_mm": 35.0}
+    metadata = PhotoMetadata(camera_maker="Test", camera_model="T-1", **seen)
     write_bayer_dng(path, mosaic, black=512, white=15512, metadata=metadata)
     return path

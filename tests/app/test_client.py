@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from unittest import mock
 
 import httpx2
 import numpy as np
@@ -92,9 +93,7 @@ def test_waiting_leaves_a_service_in_peace_that_answers_at_once(
     assert 2 <= len(asked) <= 40  # without a pause it would be hundreds
 
 
-def test_a_service_that_does_not_start_is_told_with_its_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_service_that_fails_is_told_with_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.executable", "false")
 
     with (
@@ -111,7 +110,7 @@ def test_all_pages_are_read(api: Client, steps: Steps) -> None:
     assert len(api.photos()) == 53
 
 
-def test_a_corrected_photo_is_saved_whole_or_not_at_all(
+def test_a_result_is_saved_whole_or_not(
     client: TestClient, api: Client, steps: Steps, tmp_path: Path
 ) -> None:
     correction = api.correct(steps.counted().public_id, method="fast", output={"format": "png16"})
@@ -172,10 +171,8 @@ def test_a_lens_is_asked_named_merged_and_sent_on(
 
 
 def test_an_error_page_of_a_proxy_is_told_as_it_is() -> None:
-    def proxy(request: httpx2.Request) -> httpx2.Response:
-        return httpx2.Response(502, text="<html>bad gateway</html>")
-
-    http = httpx2.Client(base_url="http://test", transport=httpx2.MockTransport(proxy))
+    proxy = httpx2.MockTransport(lambda _: httpx2.Response(502, text="<html>bad gateway</html>"))
+    http = httpx2.Client(base_url="http://test", transport=proxy)
 
     with Client(http=http) as client, pytest.raises(ServiceProblemError, match="bad gateway"):
         client.photo("x")
@@ -198,14 +195,9 @@ def job_of(state: str) -> httpx2.Response:
 def test_waiting_outlasts_a_restart_of_a_service_that_was_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.client.AWAY_SECONDS", 0.0)
     away = httpx2.ConnectError("no")
-    answers = iter([job_of("running"), away, *map(httpx2.Response, (502, 503)), job_of("succeeded"), away])
-
-    def flaky(_: httpx2.Request) -> httpx2.Response:
-        if isinstance(answer := next(answers), Exception):
-            raise answer
-        return answer
-
-    with httpx2.Client(transport=httpx2.MockTransport(flaky), base_url="http://x") as http:
+    answers = [job_of("running"), away, *map(httpx2.Response, (502, 503)), job_of("succeeded"), away]
+    flaky = httpx2.MockTransport(mock.Mock(side_effect=answers))
+    with httpx2.Client(transport=flaky, base_url="http://x") as http:
         assert Client(http=http).wait("1").state == "succeeded"
         with pytest.raises(httpx2.ConnectError):
             Client(http=http).wait("1")

@@ -79,9 +79,7 @@ def alive(pids: list[int]) -> list[int]:
     return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
-def test_a_photo_calibrates_the_lens_that_it_names_once(
-    service: Service, first: dict[str, Any], photos: Path
-) -> None:
+def test_a_photo_calibrates_its_lens_once(service: Service, first: dict[str, Any], photos: Path) -> None:
     lens, again = lens_of(service, first), service.upload(photos / "first.dng", status=200)
     place: dict[str, str | float] = {"r": 0.4, "phi": 0.3, "aperture": 2.8, "channel": "g", "size": 21}
     kernel = np.array(service.get(f"/v1/lenses/{first['lens_id']}/psf", params=place)["psf"]["data"])
@@ -109,9 +107,7 @@ def test_events_tell_the_way_of_a_photo_to_its_end(service: Service, photos: Pat
     assert len(seen) > 2
 
 
-def test_a_stored_photo_is_corrected_and_the_result_is_sharper(
-    service: Service, first: dict[str, Any], photos: Path
-) -> None:
+def test_a_stored_photo_is_corrected_sharper(service: Service, first: dict[str, Any], photos: Path) -> None:
     def corrected(**options: Any) -> httpx2.Response:
         made = service.http.post("/v1/corrections", json={"photo_id": stored["id"], **options}).json()
         assert service.job(made["id"])["state"] == "succeeded"

@@ -75,15 +75,16 @@ def package(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def installed(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def installed(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(package))
     registry._entry_points.cache_clear()
-    yield package
+    yield
     registry._entry_points.cache_clear()
     sys.modules.pop("own_methods", None)
 
 
-def test_methods_of_a_package_are_known_by_their_names_and_correct(installed: Path) -> None:
+@pytest.mark.usefixtures("installed")
+def test_methods_of_a_package_are_known_by_their_names_and_correct() -> None:
     assert "careful" in lensmodel.estimators
     assert "everywhere" in list(lensmodel.selectors)
     assert lensmodel.estimators.create("careful").name == "careful"
@@ -96,14 +97,11 @@ def test_methods_of_a_package_are_known_by_their_names_and_correct(installed: Pa
     assert corrected.planes.shape == planes.shape
 
 
-def test_a_package_that_cannot_be_loaded_is_named(installed: Path) -> None:
+@pytest.mark.usefixtures("installed")
+def test_a_package_that_cannot_be_loaded_is_named_and_none_replaces_a_method() -> None:
     lensmodel.estimators.load_installed()  # says so in the log, and goes on
-
     with pytest.raises(UnknownMethodError, match=r"broken.*own-methods cannot be loaded"):
         lensmodel.estimators.create("broken")
-
-
-def test_a_package_replaces_nothing(installed: Path) -> None:
     taken: Registry[object] = Registry("estimator", {"careful": dict}, "lensmodel.estimators")
 
     assert taken.create("careful") == {}

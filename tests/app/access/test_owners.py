@@ -105,7 +105,7 @@ def requests(client: TestClient, ids: dict[str, str]) -> Iterator[tuple[str, str
         yield method, address, {**options, "params": {**options.get("params", {}), **needed}}
 
 
-def test_a_second_owner_finds_nothing_of_the_first_on_any_route(
+def test_an_owner_finds_nothing_of_another_on_any_route(
     guarded: TestClient, store: Store, steps: Steps
 ) -> None:
     ids = furnish(guarded, steps, "anna")
@@ -170,9 +170,7 @@ def test_ids_in_bodies_and_queries_of_another_owner_are_unknown_too_and_nothing_
     assert own.aperture == 1.4
 
 
-def test_the_same_bytes_of_two_owners_are_two_photos_and_one_goes_without_the_other(
-    guarded: TestClient, store: Store
-) -> None:
+def test_the_same_bytes_of_two_owners_are_two_photos(guarded: TestClient, store: Store) -> None:
     jpeg = b"\xff\xd8\xff" + bytes(200)
     anna, ben = key_of(store, "anna"), key_of(store, "ben")
 
@@ -187,7 +185,7 @@ def test_the_same_bytes_of_two_owners_are_two_photos_and_one_goes_without_the_ot
     assert guarded.get(f"/v1/photos/{second.json()['id']}", headers=ben).status_code == 200
 
 
-def test_every_route_but_probes_and_the_sign_in_wants_to_know_who_asks(
+def test_every_route_but_probes_and_sign_in_needs_a_key(
     guarded: TestClient, store: Store, steps: Steps
 ) -> None:
     ids = dict.fromkeys(("photo_id", "lens_id", "job_id", "correction_id"), "x")
@@ -212,9 +210,7 @@ def test_a_person_who_is_not_signed_in_is_sent_to_the_page_for_it(guarded: TestC
     assert guarded.get("/static/session.js").status_code == 200
 
 
-def test_a_browser_signs_in_with_a_cookie_that_no_script_and_no_other_site_gets(
-    guarded: TestClient, store: Store
-) -> None:
+def test_a_browser_signs_in_with_a_cookie_for_this_site_alone(guarded: TestClient, store: Store) -> None:
     text = key_of(store, "anna")["Authorization"].removeprefix("Bearer ")
     at_home = {"Host": "127.0.0.1:8000"}
 
@@ -395,7 +391,7 @@ def test_a_key_is_made_listed_and_ended(tmp_path: Path) -> None:
         ("revoke abcd2345", InvalidInputError, "no key begins with abcd2345"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_sentence(
+def test_nonsense_is_refused_in_a_sentence(
     tmp_path: Path, words: str, error: type[Exception], said: str
 ) -> None:
     with pytest.raises(error, match=said):
@@ -467,7 +463,7 @@ def test_an_archive_of_many_files_takes_time_in_proportion_to_them() -> None:
     assert seconds(25_000) < 12 * seconds(5_000)  # five times as many
 
 
-def test_an_erased_account_leaves_no_row_and_no_file(
+def test_erasure_leaves_no_row_and_file(
     client: TestClient, store: Store, steps: Steps, storage: Storage
 ) -> None:
     steps.owner = "other"
@@ -488,7 +484,7 @@ def test_an_erased_account_leaves_no_row_and_no_file(
     assert client.get("/v1/photos").json()["items"] == []
 
 
-def test_an_erasure_that_was_killed_is_carried_through_by_a_worker(
+def test_a_killed_erasure_is_carried_through_by_a_worker(
     store: Store, steps: Steps, storage: Storage
 ) -> None:
     photo = steps.counted()

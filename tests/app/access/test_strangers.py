@@ -65,9 +65,7 @@ def port(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> I
         yield opened
 
 
-def test_a_body_that_does_not_come_in_time_is_answered_and_the_connection_closed(
-    port: int, steps: Steps
-) -> None:
+def test_too_slow_a_body_is_answered_and_the_connection_closed(port: int, steps: Steps) -> None:
     lens, raw = steps.lens_id(steps.counted()), "application/octet-stream"
     for sent in (
         head("POST", "/v1/photos", 9004, raw) + TIFF[:500],
@@ -90,7 +88,7 @@ def test_a_length_that_is_nonsense_or_not_that_of_the_body_ends_the_connection(p
     assert said.count(b"HTTP/1.1") <= 2  # of the rest, at most that it is no request
 
 
-def test_photos_are_received_only_so_many_at_once(
+def test_only_so_many_photos_are_received_at_once(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     places = services_of(client).uploads
@@ -117,7 +115,7 @@ FOREIGN = [
 
 
 @pytest.mark.parametrize("headers", FOREIGN)
-def test_a_change_that_another_site_asks_for_is_refused(
+def test_changes_asked_by_other_sites_are_refused(
     client: TestClient, steps: Steps, headers: dict[str, str]
 ) -> None:
     photo = steps.receive()

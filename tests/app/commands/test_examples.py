@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 import json
 import os
 import re
@@ -11,6 +10,7 @@ import shlex
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise, takewhile
@@ -25,6 +25,7 @@ from deadline import stretched
 from PIL import Image
 from running import PROGRAM, lens_of_one_blur, scene, write_light, write_photo
 from scipy import ndimage
+from servers import free_port
 from sqlalchemy import update
 from typer.core import TyperCommand, TyperGroup
 
@@ -75,22 +76,6 @@ def test_each_example_is_understood_by_its_command(line: str) -> None:
 
     with contextlib.suppress(typer.Exit):  # `--help` ends the reading
         assert COMMANDS[name].make_context(name, words).params
-
-
-@pytest.mark.parametrize("name", ROOT.commands)
-def test_the_list_of_commands_says_of_each_what_its_own_help_begins_with(name: str) -> None:
-    listed, command = ROOT.commands[name], ROOT.imported(name)
-
-    assert command.name == listed.name
-    assert inspect.cleandoc(command.help or "").splitlines()[0] == listed.help
-
-
-def test_the_short_name_o_is_where_to_write_in_every_command() -> None:
-    found = [option for command in COMMANDS.values() for option in command.params if "-o" in option.opts]
-
-    assert len(found) > 5
-    assert all("--output" in option.opts for option in found)
-    assert all(option.help.startswith("Where to write: ") for option in found)
 
 
 # --- each example ------------------------------------------------------------------------------
@@ -234,3 +219,48 @@ def test_example_serves_and_prints_its_address_last_until_it_is_told_to_stop(lin
     assert "confined" not in after
     assert "startup complete" not in after
     assert status == 0
+
+
+# --- the pages for operators, typed word for word in an empty folder ----------------------------
+
+ELSEWHERE = "/var/lib/postgresql"
+"""Commands about another machine's disk."""
+
+
+def operators_commands() -> list[str]:
+    pages = [HERE / "docs" / name for name in ("service.md", "topics/operating.md")]
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
+    return [line for block in blocks for line in block.splitlines() if ELSEWHERE not in line]
+
+
+@pytest.mark.slow
+def test_each_command_of_the_pages_does_what_it_says(tmp_path: Path) -> None:
+    if shutil.which("curl") is None or shutil.which("bash") is None:
+        pytest.skip("needs bash and curl, as the page does")
+    port, lines = str(free_port()), ["set -e"]
+    for line in operators_commands():
+        lines.append(line.replace("8000", port))
+        if line.endswith("&"):  # a person waits for the address
+            lines.append(f"until curl -sf http://127.0.0.1:{port}/readyz > ready; do sleep 0.2; done")
+    home = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
+    home["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{home['PATH']}"
+
+    shell = subprocess.Popen(
+        ["bash", "-c", "\n".join(lines)],
+        cwd=tmp_path,
+        env=home,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        said, _ = shell.communicate(timeout=600)
+    finally:
+        with contextlib.suppress(ProcessLookupError):  # a service that a failed command left behind
+            os.killpg(shell.pid, signal.SIGKILL)
+
+    assert shell.returncode == 0, said
+    assert "lensmodel_queue_jobs" in said
+    assert (tmp_path / "my-backup").is_dir()

@@ -163,9 +163,7 @@ def test_jobs_of_a_killed_worker_are_taken_over_only_when_somebody_says_so(
 
 
 @pytest.mark.slow
-def test_a_job_that_kills_every_worker_is_given_up(
-    start: Start, url: str, ran: list[tuple[str, ...]]
-) -> None:
+def test_a_job_that_kills_all_workers_is_given_up(start: Start, url: str, ran: list[tuple[str, ...]]) -> None:
     assert dies(url, "a-worker-that-died", ASKS)
     for number in range(MAX_DEATHS["correction"] + 1):
         if not dies(url, f"worker-{number}", TAKES_OVER):
@@ -295,9 +293,7 @@ def failed(steps: Steps, kind: Kind) -> str:
 
 
 @pytest.mark.parametrize("kind", ["photo", "correction"])
-def test_a_failed_job_is_retried_as_another_job_of_the_engine(
-    client: TestClient, steps: Steps, kind: Kind
-) -> None:
+def test_a_failed_job_is_retried_as_another_job(client: TestClient, steps: Steps, kind: Kind) -> None:
     key = failed(steps, kind)
 
     answer, again = (client.post(f"/v1/jobs/{key}/retry") for _ in range(2))

@@ -112,9 +112,7 @@ def test_whatever_a_child_wrote_instead_is_refused(tmp_path: Path, damage: Damag
         returned_samples(tmp_path, count=1)
 
 
-def test_entries_that_are_too_long_to_read_are_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_long_entries_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_samples(tmp_path, [SAMPLE])
     monkeypatch.setattr(sample_files, "MAX_RESULT", 100)
 

@@ -127,7 +127,7 @@ def test_a_worker_keeps_its_lease_while_its_engine_starts(
     assert beats == [True]
 
 
-def test_a_worker_that_gets_no_connection_for_a_lease_stops(
+def test_a_worker_without_connection_for_a_lease_stops(
     worker: Worker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def beat(_: str) -> bool:
@@ -166,7 +166,7 @@ def are_counted(store: Store) -> bool:
     return set(states(store)) == {"counted"}
 
 
-def test_photos_in_the_queue_are_read_while_others_are_worked_on(
+def test_photos_are_read_while_others_are_in_work(
     crew: Crew, store: Store, sent: Callable[[int], None]
 ) -> None:
     def are_read() -> bool:

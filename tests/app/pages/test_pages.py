@@ -210,9 +210,7 @@ def test_an_empty_service_says_how_to_begin(page: Page) -> None:
     assert faults(page) == []
 
 
-def test_photos_chosen_and_dropped_are_learned_from_while_the_page_watches(
-    page: Page, tmp_path: Path
-) -> None:
+def test_photos_chosen_and_dropped_are_followed_on_the_page(page: Page, tmp_path: Path) -> None:
     chosen, dropped = small(tmp_path / "chosen.dng", 1, "C-1"), small(tmp_path / "dropped.dng", 2, "C-1")
     page.goto("/")
     page.evaluate("window.first = true")
@@ -244,9 +242,7 @@ def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor
     visitor.complaints.clear()
 
 
-def test_a_file_that_is_dropped_elsewhere_leaves_the_page_as_it_was(
-    page: Page, pages: dict[str, str]
-) -> None:
+def test_a_file_dropped_elsewhere_leaves_the_page_as_it_was(page: Page, pages: dict[str, str]) -> None:
     page.goto(pages["lens"])
     dropped = DROP.replace("document.querySelector", "window.prevented = !document.querySelector")
     drop(page, "holiday.nef", b"any", dropped)
@@ -299,9 +295,7 @@ def test_a_button_waits_until_the_scripts_of_the_page_are_there(page: Page, lear
     expect(page.get_by_role("button", name="Delete photo")).to_be_disabled()
 
 
-def test_an_aperture_is_asked_for_where_photos_do_not_say_it(
-    page: Page, service: Service, tmp_path: Path
-) -> None:
+def test_an_aperture_is_asked_for_where_it_is_missing(page: Page, service: Service, tmp_path: Path) -> None:
     sent = waiting(service, small(tmp_path / "old.dng", 33, "", aperture=None))
     page.goto("/")
     group = page.locator(".group")
@@ -357,9 +351,7 @@ def test_photos_that_wait_are_named_together_by_their_pictures(
     expect(page.get_by_role("button", name="Correct this photo")).to_be_in_viewport()
 
 
-def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour_and_its_versions(
-    page: Page, pages: dict[str, str]
-) -> None:
+def test_a_lens_shows_its_blur_anywhere_and_its_versions(page: Page, pages: dict[str, str]) -> None:
     open_complete(page, pages["tests"])
     field, words, drawn = page.locator("#field"), page.locator("#psf-words"), page.locator("#psf")
     expect(words).to_contain_text("of the way to the corner")
@@ -533,7 +525,7 @@ def download(page: Page, link: str, folder: Path) -> Path:
     return path
 
 
-def test_photos_are_chosen_corrected_and_downloaded_together(
+def test_photos_are_corrected_and_downloaded_together(
     page: Page, pages: dict[str, str], tmp_path: Path
 ) -> None:
     page.goto(pages["lens"])
@@ -584,9 +576,7 @@ def test_a_lens_answers_three_questions_on_one_screen(page: Page, pages: dict[st
     expect(page.locator(".verdict")).to_contain_text("At f/5.6")
 
 
-def test_a_lens_has_charts_that_are_read_and_a_report(
-    page: Page, pages: dict[str, str], tmp_path: Path
-) -> None:
+def test_a_lens_has_legible_charts_and_a_report(page: Page, pages: dict[str, str], tmp_path: Path) -> None:
     open_complete(page, pages["lens"])
     page.get_by_role("link", name="Charts and figures").click()
     chart = page.locator("#charts img").first

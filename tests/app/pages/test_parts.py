@@ -174,9 +174,7 @@ def test_tiles_before_and_after_show_one_place_and_are_not_decoded(
     assert [client.get(f"{base}/after/{name}.jpg").status_code for name in missing] == [404] * 3
 
 
-def test_tiles_that_a_child_wrote_wrongly_are_refused(
-    client: TestClient, corrected: dict[str, Any], storage: Storage
-) -> None:
+def test_damaged_tiles_are_refused(client: TestClient, corrected: dict[str, Any], storage: Storage) -> None:
     key = f"corrections/{corrected['id']}/1-1/{SIDES['after']}"
     right = storage.get(key)
     for change, wrong in {
@@ -226,7 +224,7 @@ def test_what_was_held_back_is_drawn_once_and_turned_as_the_photo_is(orientation
     assert drawn.min() == drawn.max() == 1
 
 
-def test_pages_of_a_photo_and_of_its_correction_compare_it(
+def test_a_photo_and_its_correction_are_compared(
     client: TestClient, corrected: dict[str, Any], store: Store
 ) -> None:
     correction_id, photo = corrected["id"], corrected["photo_id"]
@@ -435,9 +433,7 @@ def test_no_lens_is_chosen_beforehand_for_a_photo_that_names_none(client: TestCl
 # --- lenses -------------------------------------------------------------------------------------------
 
 
-def test_a_lens_that_was_named_before_any_photo_is_listed_and_none_whose_photos_failed(
-    client: TestClient, steps: Steps
-) -> None:
+def test_named_lenses_are_listed_and_not_those_whose_photos_failed(client: TestClient, steps: Steps) -> None:
     named, tried = (client.post("/v1/lenses", json={"label": label}).json() for label in ("Bench", "Tried"))
     photo = steps.receive(lens_id=tried["id"])
     steps.inspect(photo, serial=None)
@@ -488,9 +484,7 @@ def test_the_page_of_a_lens_shows_the_aperture_that_is_asked_for_and_no_empty_se
 # --- open pages ---------------------------------------------------------------------------------------
 
 
-def test_an_open_page_is_told_what_changed_and_when_its_session_is_over(
-    settings: Settings, store: Store, steps: Steps
-) -> None:
+def test_an_open_page_is_told_changes_and_its_end(settings: Settings, store: Store, steps: Steps) -> None:
     photo, key = steps.receive(), store.accounts.create_key("local", ["write"])
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
         stranger = {"HX-Request": "true", "HX-Current-URL": "http://h/?a=b"}

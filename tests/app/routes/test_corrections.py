@@ -122,9 +122,7 @@ def test_without_a_lens_that_is_known_nothing_is_corrected(client: TestClient, s
     assert refusal(post(client, photo_id=first.public_id)) == (409, "no_samples")
 
 
-def test_a_preview_is_its_pages_own_which_deletes_it_while_another_asks(
-    client: TestClient, photo: str
-) -> None:
+def test_a_preview_belongs_to_its_page_which_deletes_it(client: TestClient, photo: str) -> None:
     wish = {"photo_id": photo, "roi": {"x": 0, "y": 0, "width": 9, "height": 9}}
     left, opened, same = (post(client, **wish, nonce=word).json()["id"] for word in ("1-2", "3-4", "3-4"))
 
@@ -133,9 +131,7 @@ def test_a_preview_is_its_pages_own_which_deletes_it_while_another_asks(
     assert opened == same
 
 
-def test_the_result_waits_for_the_work_which_is_cancelled_once(
-    client: TestClient, store: Store, photo: str
-) -> None:
+def test_the_result_waits_for_the_work_until_cancelled(client: TestClient, store: Store, photo: str) -> None:
     made = post(client, photo_id=photo).json()
     run = store.jobs.start(made["id"], 1)
     assert run is not None
@@ -152,7 +148,7 @@ def test_the_result_waits_for_the_work_which_is_cancelled_once(
     assert client.get(made["links"]["self"]).json()["error"]["code"] == "cancelled"
 
 
-def test_a_failed_correction_says_why_and_can_be_asked_for_again(
+def test_a_failed_correction_says_why_and_can_be_repeated(
     client: TestClient, store: Store, photo: str
 ) -> None:
     made = post(client, photo_id=photo).json()
@@ -165,7 +161,7 @@ def test_a_failed_correction_says_why_and_can_be_asked_for_again(
     assert post(client, photo_id=photo).json()["id"] != made["id"]
 
 
-def test_the_result_is_the_file_that_was_made_and_parts_of_it_join_to_the_whole(
+def test_the_result_is_the_file_made_and_its_parts_join_to_the_whole(
     client: TestClient, finished: str
 ) -> None:
     address = client.get(f"/v1/corrections/{finished}").json()["links"]["result"]
@@ -212,9 +208,7 @@ def test_corrections_are_listed_by_photo_and_deleted_with_their_file(
     assert not (settings.data_dir / "blobs" / "corrections" / finished).exists()
 
 
-def test_results_count_for_the_quota_and_expire(
-    client: TestClient, finished: str, photo: str, store: Store
-) -> None:
+def test_results_take_quota_and_expire(client: TestClient, finished: str, photo: str, store: Store) -> None:
     taken = client.get("/v1/account").json()["stored_bytes"]
     assert taken == 1000 + len(FILE) + 77  # the photo, its result, and the pictures of that
     with store.database.writing() as session:

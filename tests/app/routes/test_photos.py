@@ -17,7 +17,7 @@ from states import TIFF, Steps, refusal, stored
 
 from app.http.dependencies import Call
 from app.jobs import tasks
-from app.jobs.answers import SAMPLES, JobFailedError
+from app.jobs.answers import JobFailedError
 from app.jobs.sample_files import write_samples
 from app.jobs.work import _measured
 from app.routes import jobs
@@ -125,9 +125,7 @@ def test_a_photo_that_was_stored_can_still_teach_its_lens_unless_its_file_is_gon
 
 
 @pytest.mark.parametrize("way", ["lens_id", "lens_serial", "new_lens"])
-def test_a_photo_without_a_lens_waits_and_starts_again_once_that_is_named(
-    client: TestClient, steps: Steps, way: str
-) -> None:
+def test_a_photo_waits_for_its_lens_and_starts_again(client: TestClient, steps: Steps, way: str) -> None:
     known, photo = steps.lens_id(steps.counted(serial="123")), steps.waiting()
     job, shown = (get(client, f"{kind}/{photo.public_id}") for kind in ("jobs", "photos"))
     name = {"lens_id": known, "lens_serial": "123", "new_lens": {"label": "the scratched one"}}[way]
@@ -216,7 +214,7 @@ def test_a_waiting_request_answers_at_the_change(
     assert time.monotonic() - began < 8.0  # it did not wait to the end
 
 
-def test_a_finished_job_does_not_make_anybody_wait(
+def test_a_finished_job_answers_at_once(
     client: TestClient, steps: Steps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo, reads = steps.counted(), after_first_read(monkeypatch)
@@ -292,24 +290,18 @@ def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.Monk
     assert {(sample.estimator, sample.weight) for _, sample in samples} == {("measured-quick/3", 1.0)}
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [
-        *({"settings": {"channel": "x"}}, {"r": 2.0}, {"weight": 2.0}, {"row": "a"}),
-        *({"error": error} for error in (None, 7.0, math.nan)),
-        *({"idx": number} for number in (-1, math.inf)),
-    ],
-)
-def test_nonsense_of_a_child_is_refused(tmp_path: Path, changed: dict[str, Any]) -> None:
-    said = PLACE | {"settings": {"channel": "g"}} | changed
-    with pytest.raises(JobFailedError):  # it gave no kernels
-        _measured([said], tmp_path)
-    write_samples(tmp_path, [PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.0, 0.0), estimator="any/1")])
-    (entry,) = json.loads((tmp_path / SAMPLES).read_text())
-    (tmp_path / SAMPLES).write_text(json.dumps([entry | said]))
+def test_nonsense_of_a_child_is_refused(tmp_path: Path) -> None:
+    def measured(error: float | None = 0.04, **place: Any) -> None:
+        at = FieldPosition(0.0, 0.0)
+        write_samples(tmp_path, [PsfSample(gaussian(15, np.eye(2)), at, estimator="any/1", error=error)])
+        _measured([PLACE | place], tmp_path)
 
     with pytest.raises(JobFailedError, match="gave no kernels"):
-        _measured([said], tmp_path)
+        _measured([PLACE], tmp_path)
+    measured()
+    for nonsense in ({"row": "a"}, {"idx": -1}, {"idx": math.inf}, {"error": None}):
+        with pytest.raises(JobFailedError, match="gave no kernels"):
+            measured(**nonsense)
 
 
 def send(client: TestClient, steps: Steps, **fields: str) -> tuple[Any, str]:

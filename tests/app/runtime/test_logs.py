@@ -112,7 +112,7 @@ def test_the_line_of_a_request_says_what_was_asked_and_answered_and_those_from_w
     assert within["request_id"] == "asked-1"
 
 
-def test_a_connection_that_is_kept_gives_nothing_of_one_request_to_the_next(
+def test_a_kept_connection_gives_nothing_to_the_next_request(
     settings: Settings, store: Store, said: Said
 ) -> None:
     with served(settings) as port, httpx2.Client(base_url=f"http://127.0.0.1:{port}") as http:
@@ -171,9 +171,7 @@ def test_depth_and_age_of_the_queue_are_those_of_the_tables(client: TestClient, 
     assert values["lensmodel_workers{}"] == 0
 
 
-def test_requests_and_psf_queries_are_counted_by_route_and_never_by_id(
-    client: TestClient, steps: Steps
-) -> None:
+def test_requests_are_counted_by_route_and_never_by_id(client: TestClient, steps: Steps) -> None:
     lens = steps.lens_id(steps.counted())
     before = asked(client)
     for _ in range(2):

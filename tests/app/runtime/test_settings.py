@@ -78,7 +78,7 @@ def test_a_port_that_is_taken_is_named() -> None:
             listen("127.0.0.1", port)
 
 
-def test_every_setting_of_the_compose_file_is_known_and_they_fit_together(
+def test_the_settings_of_the_compose_file_fit_together(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     environment = OURS["api"]["environment"]
@@ -110,15 +110,3 @@ def test_no_secret_is_written_down_no_image_floats_and_ports_are_on_loopback(nam
     assert all(port.startswith("127.0.0.1:") for port in service.get("ports", []))
     for other, wait in service.get("depends_on", {}).items():  # that is there, and can tell its health
         assert wait["condition"] != "service_healthy" or "test" in SERVICES[other]["healthcheck"]
-
-
-def test_dockerfile_ends_as_a_user_without_rights_and_says_its_health() -> None:
-    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
-    last = text.rsplit("\nFROM ", 1)[1]
-
-    assert text.count("\nFROM ") == 2
-    assert "ARG BASE=" in text
-    assert re.search(r"^USER 10001", last, re.MULTILINE)
-    assert "VOLUME /data" in last
-    assert "HEALTHCHECK" in last
-    assert not re.search(r"^ADD ", text, re.MULTILINE)

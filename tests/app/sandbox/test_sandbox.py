@@ -141,9 +141,7 @@ def test_open_files_are_limited(run: Run) -> None:
     assert 16 < run("open_files", limits=replace(LIMITS, open_files=64)).value < 64
 
 
-def test_cancelling_kills_the_child_and_what_it_started(
-    sandbox: Sandbox, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cancelling_kills_a_child_and_its_children(sandbox: Sandbox, monkeypatch: pytest.MonkeyPatch) -> None:
     # as where the kernel cannot keep it from starting programs
     monkeypatch.setattr(runner, "TASKS_MODULE", "unconfined_tasks")
     with sandbox.folder() as folder:
@@ -237,7 +235,7 @@ def reachable() -> Iterator[tuple[str, Path]]:
         pytest.skip("no interpreter that another account may use has the libraries")
 
 
-def test_another_account_alone_keeps_a_task_from_all_files_and_processes(
+def test_another_account_keeps_a_task_from_all_files_and_processes(
     reachable: tuple[str, Path],
 ) -> None:
     program, data = reachable
@@ -312,9 +310,7 @@ def test_an_outage_is_what_the_machine_lacks_and_not_what_a_child_says(
         assert kept(status).ending == ("outage" if full else "crashed")
 
 
-def test_a_path_beneath_a_file_leaves_all_measures_in_force(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_path_beneath_a_file_disables_no_measure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     in_force("files")
     (tmp_path / "library.zip").touch()
     monkeypatch.setenv("PYTHONPATH", f"{confine.__file__}/inner:{tmp_path / 'library.zip'}/inner")

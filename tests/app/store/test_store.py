@@ -158,9 +158,7 @@ def test_a_correction_by_the_owner_goes_before_the_header(store: Store, steps: S
     assert (steps.fresh(photo).epoch, steps.fresh(photo).aperture) == (3, 2.0)
 
 
-def test_a_correction_of_a_counted_photo_renews_its_samples_and_starts_nothing(
-    store: Store, steps: Steps
-) -> None:
+def test_changing_a_counted_photo_renews_its_samples(store: Store, steps: Steps) -> None:
     photo = steps.counted()
 
     assert store.photos.change([photo.public_id], OWNER, {"aperture": 2.0})
@@ -370,9 +368,7 @@ def test_corrections_of_a_deleted_lens_that_are_finished_stay(store: Store, step
 # --- corrections, workers, garbage ------------------------------------------------------------
 
 
-def test_a_correction_is_finished_by_the_last_who_took_it_up_and_not_once_it_is_cancelled(
-    store: Store, steps: Steps
-) -> None:
+def test_a_correction_is_finished_by_who_took_it_up_last_unless_cancelled(store: Store, steps: Steps) -> None:
     jobs, row = store.jobs, steps.correct(steps.counted())
     file = {"key": "k", "etag": "e", "media_type": "image/tiff", "bytes": 1, "name": "n"}
     lost, run = jobs.start(row.public_id, 1), jobs.start(row.public_id, 1)
@@ -474,9 +470,7 @@ def server(settings: Settings) -> Iterator[Steps]:
 
 
 @pytest.mark.parametrize("kind", ["steps", pytest.param("server", marks=pytest.mark.tools)])
-def test_the_samples_of_a_lens_are_of_the_version_that_comes_with_them(
-    kind: str, request: pytest.FixtureRequest
-) -> None:
+def test_samples_are_of_the_version_that_comes_with_them(kind: str, request: pytest.FixtureRequest) -> None:
     """Let a photo be counted between the two statements that read the version and the samples."""
     steps: Steps = request.getfixturevalue(kind)
     reader, lens, during = steps.store.database.reader, steps.lens_id(steps.counted()), list[PhotoRow]()

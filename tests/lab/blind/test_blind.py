@@ -144,7 +144,7 @@ class Oracle(Fake):
         return PsfEstimate(psf.as_kernel(off_centre), 0.5, 0.3)
 
 
-def test_error_ratio_of_the_true_kernel_is_one_even_when_it_is_off_centre(
+def test_error_ratio_of_the_true_kernel_is_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     kernel = load_psfs()[3]
@@ -159,7 +159,7 @@ def test_error_ratio_of_the_true_kernel_is_one_even_when_it_is_off_centre(
         assert row.improved
 
 
-def test_what_does_harm_is_told_from_what_declines_and_leaves_the_patch_untouched(
+def test_harm_is_told_from_declining_which_leaves_the_patch(
     report: BlindReport,
 ) -> None:
     wide = next(row for row in summarised(report.results) if row["method"] == "wide")

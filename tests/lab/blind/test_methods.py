@@ -101,9 +101,7 @@ def shaken(photo: Path, kernel: Kernel, seed: int, side: int = 256) -> Plane:
 
 @pytest.mark.tools
 @pytest.mark.parametrize(("name", "median", "least"), [("zhang", 0.95, 0.9), ("sun", 0.8, 0.6)])
-def test_camera_shake_is_recovered_from_photographs(
-    shared_data: Path, name: str, median: float, least: float
-) -> None:
+def test_camera_shake_is_recovered(shared_data: Path, name: str, median: float, least: float) -> None:
     kernels = motion_kernels(shared_data / "psf" / "levin09_motion_kernels.mat")
     assert [kernel.shape[0] for kernel in kernels] == [19, 17, 15, 27, 13, 21, 23, 23]
     similar, nothing = [], []

@@ -82,9 +82,7 @@ def test_a_drawn_lens_has_centred_kernels_and_is_the_same_again(family: str) -> 
 
 
 @pytest.mark.parametrize(("separation", "diffusion"), [(0.8, 0.0), (0.0, 1.3), (0.6, 0.7)])
-def test_a_sensor_adds_the_variances_of_its_filter_and_its_diffusion(
-    separation: float, diffusion: float
-) -> None:
+def test_a_sensor_adds_variances_of_filter_and_diffusion(separation: float, diffusion: float) -> None:
     kernel = np.exp(-0.5 * (AT[:, None] ** 2 + AT**2) / 2.0**2)[None].astype(np.float32)
     kernel /= kernel.sum()
     blurred = behind_sensor(kernel, separation, diffusion)

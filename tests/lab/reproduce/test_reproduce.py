@@ -105,9 +105,7 @@ def test_traced_case_has_the_pitch_the_aperture_and_the_truth_of_its_grid() -> N
     np.testing.assert_array_equal(one.truth().kernel_at(place, "b", 31), grid.kernel_at(place, "b", 31))
 
 
-def test_a_design_at_two_apertures_is_two_lenses_of_fig_2(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_design_at_two_apertures_is_two_lenses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     grid, seen = read_grid(HELIAR), list[PsfField]()
     replace(grid, facts={**grid.facts, "f_number": 5.6}).write(tmp_path / "stopped.npz")
 
@@ -439,7 +437,7 @@ def test_json_holds_results_summary_and_bars(tmp_path: Path) -> None:
 # --- measuring ---------------------------------------------------------------------------------
 
 
-def test_true_kernels_have_no_error_and_a_cautious_prediction_is_wrong(
+def test_true_kernels_have_no_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     few = [(FieldPosition(r, 0.5), c) for r in (0.1, 0.5, 0.9) for c in CHANNELS]
@@ -481,9 +479,7 @@ def test_scenery_is_light_of_the_same_frame_and_not_the_scene_itself(name: str) 
 
 
 @pytest.mark.parametrize("name", ["tiff", "jpeg"])
-def test_photo_of_another_kind_shows_what_the_raw_one_does(
-    tmp_path: Path, name: Literal["tiff", "jpeg"]
-) -> None:
+def test_other_kinds_of_photos_show_what_raw_ones_do(tmp_path: Path, name: Literal["tiff", "jpeg"]) -> None:
     files = photographs(tmp_path, 4)
     one = Case(1006, (1,), 32, 64, layout_for(files, (32, 64)))
     folder = tmp_path / "photos"
@@ -602,9 +598,7 @@ def test_run_that_was_killed_keeps_what_it_has_and_ends_as_if_it_had_not_been(
 
 
 @pytest.mark.usefixtures("quick_photos")
-def test_each_choice_of_lenses_keeps_figures_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_choice_of_lenses_keeps_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def drawn(cases: Sequence[Case], path: Path) -> dict[str, Any]:
         path.write_text(cases[0].name)
         return {"picture": path.name}

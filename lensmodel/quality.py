@@ -335,20 +335,6 @@ class FoundEdge:
         return row + (height - 1) / 2.0, col + (width - 1) / 2.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Segment:
-    """Windows along one edge: its middle, its unit direction, (row, col), and half its length, pixels."""
-
-    middle: NDArray[np.float64]
-    along: NDArray[np.float64]
-    half: float
-
-    def at(self, share: float) -> tuple[float, float]:
-        """The point at a share of the half length from the middle."""
-        row, col = (self.middle + share * self.half * self.along).tolist()
-        return row, col
-
-
 def find_edges(
     plane: NDArray[np.floating], *, noise: NoiseModel = _SILENT, clip: float = 1.0
 ) -> tuple[FoundEdge, ...]:
@@ -362,10 +348,10 @@ def find_edges(
     found: list[FoundEdge] = []
     with np.errstate(all="ignore"):  # light beyond what float32 can square is no edge
         segments = _segments(block_means(np.asarray(plane, dtype=np.float32), _MEAN))
-    for number, segment in enumerate(segments[:_TRIED]):
+    for number, ends in enumerate(segments[:_TRIED]):
         if number == _FIRST and len(found) < LEAST_ON_A_CHART:
             return ()
-        if (edge := _edge_on(plane, segment, noise, clip)) is not None:
+        if (edge := _edge_on(plane, ends, noise, clip)) is not None:
             found.append(edge)
     usual = float(np.median([edge.response.step for edge in found])) if found else 0.0
     edges = tuple(edge for edge in found if edge.response.step > _LEAST_OF_USUAL * usual)
@@ -375,23 +361,24 @@ def find_edges(
 
 
 def _edge_on(
-    plane: NDArray[np.floating], segment: _Segment, noise: NoiseModel, clip: float
+    plane: NDArray[np.floating], ends: NDArray[np.float64], noise: NoiseModel, clip: float
 ) -> FoundEdge | None:
-    """Measure an edge in its middle, or beside it where the middle is spoilt."""
-    for share in (0.0, -0.5, 0.5):
-        row, col = segment.at(share)
+    """Measure an edge between two ends in its middle, or beside it where the middle is spoilt."""
+    (row_1, col_1), (row_2, col_2) = ends.tolist()
+    for share in (0.5, 0.25, 0.75):
+        row, col = ends[0] + share * (ends[1] - ends[0])
         for side in SIDES:
             top, left = round(row) - side // 2, round(col) - side // 2
             if min(top, left) < 0 or top + side > plane.shape[0] or left + side > plane.shape[1]:
                 continue
             response = _edge_of(plane[top : top + side, left : left + side], noise, clip)
             if response is not None:
-                return FoundEdge((top, left, side, side), response, (segment.at(-1.0), segment.at(1.0)))
+                return FoundEdge((top, left, side, side), response, ((row_1, col_1), (row_2, col_2)))
     return None
 
 
-def _segments(means: NDArray[np.float32]) -> list[_Segment]:
-    """Edges as runs of windows that each hold one straight edge and nothing else, strongest first."""
+def _segments(means: NDArray[np.float32]) -> list[NDArray[np.float64]]:
+    """Ends of edges, as runs of windows that each hold one straight edge and no more, strongest first."""
     across = np.zeros_like(means)
     down = np.zeros_like(means)
     across[:, 1:-1] = (means[:, 2:] - means[:, :-2]) / 2
@@ -415,13 +402,13 @@ def _segments(means: NDArray[np.float32]) -> list[_Segment]:
         kind = np.where(np.abs(np.cos(angle.ravel()[part])) > math.sqrt(0.5), 1, 2) * sign
         rising[index[0][kept], index[1][kept]] = kind[kept]
         middles[index[0][kept], index[1][kept]] = middle[kept]
-    found: list[tuple[float, _Segment]] = []
+    found: list[tuple[float, NDArray[np.float64]]] = []
     for each in (-2, -1, 1, 2):
         labels, _ = ndimage.label(rising == each, structure=np.ones((3, 3)))
         for number, where in enumerate(ndimage.find_objects(labels), start=1):
             own = labels[where] == number
-            found.append((float(energy[where][own].sum()), _segment(middles[where][own])))
-    return [segment for _, segment in sorted(found, key=lambda pair: -pair[0])]
+            found.append((float(energy[where][own].sum()), _ends(middles[where][own])))
+    return [ends for _, ends in sorted(found, key=lambda pair: -pair[0])]
 
 
 def _on_one_line(
@@ -448,13 +435,12 @@ def _on_one_line(
     return kept, middle, np.where(slope >= 0.0, 1, -1)
 
 
-def _segment(points: NDArray[np.float64]) -> _Segment:
-    """Line through the middles of windows along one edge."""
+def _ends(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Ends of the line through the middles of windows along one edge."""
     center = points.mean(axis=0)
     along = np.linalg.svd(points - center)[2][0] if len(points) > 1 else np.array([1.0, 0.0])
     place = (points - center) @ along
-    low, high = float(place.min()), float(place.max())
-    return _Segment(center + (low + high) / 2.0 * along, along, (high - low) / 2.0)
+    return center + np.array([[place.min()], [place.max()]]) * along
 
 
 def _sums(plane: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -78,16 +78,15 @@ def configured(
     patch_count: int | None = None,
     selector: str | Selector = "r-map",
 ) -> Config:
-    """Return a preset with what is asked for instead, before any work; None is as there.
-
-    An estimator of kernels that takes the place of one that reads whole photos gets fewer and smaller ones.
-    """
+    """Return a preset with what is asked for instead, before any work; None is as there."""
     if model not in PRESETS:
         raise UnknownMethodError(f"no model {model!r}; known: {', '.join(PRESETS)}")
     preset = PRESETS[model]
     usual = estimators.resolve(preset.estimator)
     method = usual if estimator is None else estimators.resolve(estimator)
-    if isinstance(usual, PhotoEstimator) and not isinstance(method, PhotoEstimator):
+    if isinstance(usual, PhotoEstimator) and not isinstance(
+        method, PhotoEstimator
+    ):  # of fewer, smaller kernels
         preset = replace(preset, kernel_size=DEFAULT_KERNEL_SIZE, patches=KERNEL_PATCHES)
     asked = {"estimator": estimator, "kernel_size": kernel_size, "patches": patch_count}
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
@@ -123,8 +122,6 @@ def load_developed(folder: Path) -> LinearPhoto:
         stored = json.loads((folder / "photo.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InvalidInputError(f"{folder} holds no developed photo; develop it again") from error
-    if "turns" in stored["info"]:  # of earlier versions: None where nothing told which way
-        stored["info"]["turned"] = stored["info"]["turns"] is None
     return from_json(LinearPhoto, {**stored, "planes": planes})
 
 
@@ -142,10 +139,7 @@ def find_patches(
     estimator: str | PsfEstimator = "default",
     on_step: StepHook = ignore_step,
 ) -> Selection:
-    """Choose the patches that tell about the blur.
-
-    An estimator of whole photos chooses its own; for others `selector` scores windows of the green plane.
-    """
+    """Choose the patches that tell about the blur: by the estimator, or else by `selector`, on green."""
     developed.info.require_known_turn()
     method = estimators.resolve(estimator)
     if isinstance(method, PhotoEstimator):
@@ -196,9 +190,8 @@ def estimate_cell(
 ) -> list[PsfSample]:
     """Estimate the PSF of one field cell in each channel, green first, of a photo or the folder of one.
 
-    The patches of a cell share one kernel: their normal equations are summed, which is worth more than
-    averaging finished kernels. Each becomes a sample at its place; their weights add up to the confidence.
-    An estimator of whole photos has all patches of one in one cell, and gives each its own kernels.
+    The patches of a cell share one kernel, and their weights add up to its confidence; an estimator of whole
+    photos has all patches in one cell and gives each its own.
     """
     developed = load_developed(developed) if isinstance(developed, Path) else developed
     method = estimators.resolve(estimator)

@@ -33,11 +33,9 @@ class Registry(Generic[T]):
 
     def create(self, name: str, **params: object) -> T:
         """Build the entry called `name` from keyword parameters."""
-        if name in self.entries:
-            return self.entries[name](**params)
         if name not in self:
             raise UnknownMethodError(f"no {self.kind} {name!r}; known: {', '.join(self)}")
-        return self._installed(name)(**params)
+        return (self.entries.get(name) or self._installed(name))(**params)
 
     def load_installed(self) -> None:
         """Load the methods of installed packages now: before a process gives up the right to read files."""

@@ -16,6 +16,7 @@ import rawpy
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import BayerPattern, Plane
 from lensmodel.photo.containers import require_known_mosaic
 from lensmodel.photo.noise import estimate_noise
@@ -136,18 +137,17 @@ class Mosaic:
         width = max(2, round(_CLUSTER * scale))
         if len(counts) <= first + 1:
             return None
-        sums = np.concatenate([[0], counts.cumsum()])
-
-        def within(low: int, high: int) -> int:
-            low, high = (min(max(level, 0), len(counts)) for level in (low, high))
-            return int(sums[high] - sums[low])
-
-        at = np.arange(first, len(counts))
-        middle = int(at[np.argmax(sums[np.minimum(at + width, len(counts))] - sums[at])]) + width // 2
+        in_width = np.convolve(counts[first:], np.ones(width, dtype=np.intp))[width - 1 :]
+        middle = first + int(np.argmax(in_width)) + width // 2
         low, high = max(middle - 2 * width, 0), middle + 2 * width
-        pile, below, above = (within(low, high), within(2 * low - high, low), within(high, len(counts)))
+        pile, above = int(counts[low:high].sum()), int(counts[high:].sum())
+        below = int(counts[max(2 * low - high, 0) : low].sum())
         # More than half of a colour in one pile is an even area of a drawing, not a clipped light.
-        if not max(50, 2e-5 * sums[-1]) < pile < 0.5 * sums[-1] or pile < 5 * below or above > _STRAYS * pile:
+        if (
+            not max(50, 2e-5 * counts.sum()) < pile < 0.5 * counts.sum()
+            or pile < 5 * below
+            or above > _STRAYS * pile
+        ):
             return None
         # what of the picture lies under the pile as it does below it does not belong to it
         inside = np.cumsum(counts[low:] - below / (high - low))
@@ -215,48 +215,37 @@ class Neighbours:
 
     def __init__(self, colours: NDArray[np.uint8], period: int) -> None:
         self.shape, self.period = colours.shape, period
-        self._step = period * -(-_REACH // period)  # by which a place beyond the frame moves into it
+        self.step = period * -(-_REACH // period)  # by which a place beyond the frame moves into it
         pattern = np.where(colours[:period, :period] == 3, 1, colours[:period, :period])
-        around = [at for at in product(range(-_REACH, _REACH + 1), repeat=2) if any(at)]
-        around.sort(key=lambda at: (at[0] ** 2 + at[1] ** 2, at))
-        self.alike: dict[tuple[int, int], list[tuple[int, int]]] = {}
+        around = np.array([at for at in product(range(-_REACH, _REACH + 1), repeat=2) if any(at)])
+        around = around[np.argsort(np.square(around).sum(axis=1), kind="stable")]
+        self.alike = np.empty((period, period, _NEIGHBOURS, 2), dtype=np.int64)  # offsets, by distance
         for row, col in np.ndindex(period, period):
-            same = [
-                (down, right)
-                for down, right in around
-                if pattern[(row + down) % period, (col + right) % period] == pattern[row, col]
-            ]
-            self.alike[row, col] = same[:_NEIGHBOURS]
+            same = pattern[tuple((around + np.array([row, col])).T % period)] == pattern[row, col]
+            self.alike[row, col] = around[same][:_NEIGHBOURS]
 
-    def inside(self, rows: NDArray[np.integer], cols: NDArray[np.integer]) -> tuple[Places, Places]:
-        """Move places beyond the frame into it by whole periods: the colour stays, the pixel is another."""
-        moved_rows, moved_cols = (
-            index + self._step * ((index < 0).astype(np.int64) - (index >= length))
-            for index, length in zip((rows, cols), self.shape, strict=True)
-        )
-        return moved_rows, moved_cols
+    def _at(self, places: Places, offsets: NDArray[np.integer]) -> Places:
+        """Places at offsets (places, n, 2); those beyond the frame move into it, the colour stays."""
+        length = np.array(self.shape)
+        index = np.stack(np.divmod(places, length[1]), axis=-1)[:, None] + offsets
+        index += self.step * ((index < 0).astype(np.int64) - (index >= length))
+        return (index[..., 0] * length[1] + index[..., 1]).T
 
     def of(self, places: Places) -> Places:
         """Nearest pixels of the same colour, shape (8, places), by distance."""
         rows, cols = np.divmod(places, self.shape[1])
-        offsets = np.array([self.alike[site] for site in np.ndindex(self.period, self.period)])
-        own = offsets[(rows % self.period) * self.period + cols % self.period]  # (places, 8, 2)
-        at = self.inside(rows[:, None] + own[..., 0], cols[:, None] + own[..., 1])
-        return (at[0] * self.shape[1] + at[1]).T
+        return self._at(places, self.alike[rows % self.period, cols % self.period])
 
     def touching(self, places: Places) -> Places:
         """The pixels above, left, right and below, shape (4, places)."""
-        rows, cols = np.divmod(places, self.shape[1])
-        around = np.array([(-1, 0), (0, -1), (0, 1), (1, 0)])
-        # by twice a step where a pixel has no other beside it: of the other colour, as on the other side
-        at = self.inside(rows + around[:, :1], cols + around[:, 1:])
-        return at[0] * self.shape[1] + at[1]
+        return self._at(places, np.array([(-1, 0), (0, -1), (0, 1), (1, 0)]))
 
 
 def defects(values: NDArray[np.uint16], near: Neighbours) -> Places:
     """Find the pixels of a mosaic that stand alone, brighter or darker than all around them."""
     levels, deviations = _noise(values, near)
-    flat, places = values.ravel(), _standing_out(values, near, levels, deviations)
+    least = (_NEARLY[0] * np.interp(np.arange(1 << 16), levels, deviations)).astype(np.float32)
+    flat, places = values.ravel(), np.flatnonzero(_standing_out(values, near.alike, near.step, least))
     ring = flat[near.of(places)].astype(np.float32)
     middle = np.median(ring, axis=0)
     sign = np.sign(flat[places] - middle)
@@ -270,7 +259,7 @@ def defects(values: NDArray[np.uint16], near: Neighbours) -> Places:
     def alone(sigmas: float, contrast: float, most_beside: float) -> Places:
         chosen = np.maximum(sigmas * sigma, contrast * apart[-1]) < height
         chosen &= bumps.mean(axis=0) < most_beside * height
-        return np.sort(places[chosen & (np.abs(bumps).max(axis=0) < most_beside * height + 4.0 * sigma)])
+        return places[chosen & (np.abs(bumps).max(axis=0) < most_beside * height + 4.0 * sigma)]
 
     sure, likely = alone(*_SURE), alone(*_LIKELY)
     if len(sure) > _MOST * values.size:
@@ -280,8 +269,6 @@ def defects(values: NDArray[np.uint16], near: Neighbours) -> Places:
 
 def replace_defects(values: NDArray[np.uint16], places: Places, near: Neighbours) -> int:
     """Write the median of the nearest sound neighbours of its colour into each place; return how many."""
-    if len(places) == 0:
-        return 0
     around = near.of(places)
     ring = values[np.divmod(around, values.shape[1])].astype(np.float32)
     ring[np.isin(around, places)] = np.nan
@@ -305,33 +292,25 @@ def _noise(values: NDArray[np.uint16], near: Neighbours) -> tuple[NDArray[np.flo
     return np.array(levels), np.maximum(sigma, 0.5)  # no less than what rounding makes
 
 
+@jit
 def _standing_out(
-    values: NDArray[np.uint16], near: Neighbours, levels: NDArray[np.float64], sigma: NDArray[np.float64]
-) -> Places:
+    values: NDArray[np.uint16], alike: NDArray[np.int64], step: int, least: NDArray[np.float32]
+) -> NDArray[np.bool_]:
     """Pixels that differ from all but one of their neighbours of the colour by more than those differ."""
-    index = near.inside(*(np.arange(-_REACH, side + _REACH) for side in values.shape))
-    wide, period = values[np.ix_(*index)], near.period
-    planes = {site: np.ascontiguousarray(wide[site[0] :: period, site[1] :: period]) for site in near.alike}
-    least = (_NEARLY[0] * np.interp(np.arange(1 << 16), levels, sigma)).astype(np.float32)
-    found = []
-    for (row, col), offsets in near.alike.items():
-        site = values[row::period, col::period]
-        height, width = site.shape
-        high, second = np.zeros((2, *site.shape), np.uint16)
-        low, second_low = np.full((2, *site.shape), np.iinfo(np.uint16).max, np.uint16)
-        for down, right in offsets:
-            (top, odd_row), (left, odd_col) = (
-                divmod(_REACH + at, period) for at in (row + down, col + right)
-            )
-            one = planes[odd_row, odd_col][top : top + height, left : left + width]
-            np.maximum(second, np.minimum(high, one), out=second)
-            np.maximum(high, one, out=high)
-            np.minimum(second_low, np.maximum(low, one), out=second_low)
-            np.minimum(low, one, out=low)
-        spread = (second - np.minimum(second, second_low)).astype(np.float32)
-        need = np.maximum(np.float32(_NEARLY[1]) * spread, least[second])
-        above = site - np.minimum(site, second)
-        below = second_low - np.minimum(second_low, site)
-        rows, cols = np.nonzero(np.maximum(above, below) > need)
-        found.append((rows * period + row) * values.shape[1] + cols * period + col)
-    return np.concatenate(found)
+    height, width = values.shape
+    period = len(alike)
+    found = np.zeros((height, width), np.bool_)
+    for row in range(height):
+        for col in range(width):
+            high, second, second_low, low = 0, 0, 65535, 65535
+            for down, right in alike[row % period, col % period]:
+                i, j = row + down, col + right
+                i += step if i < 0 else -step if i >= height else 0
+                j += step if j < 0 else -step if j >= width else 0
+                one = int(values[i, j])
+                second, high = max(second, min(high, one)), max(high, one)
+                second_low, low = min(second_low, max(low, one)), min(low, one)
+            own = int(values[row, col])
+            need = max(_NEARLY[1] * max(second - second_low, 0), least[second])
+            found[row, col] = max(own - second, second_low - own) > need
+    return found

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, optimize
 
 from lensmodel.core.types import NoiseModel, Plane, Planes, block_means
 
@@ -62,7 +62,7 @@ def coding_noise(coarseness: float, curve: NDArray[np.floating]) -> NoiseModel |
     levels, widths = codes[1:-1].astype(np.float64), np.gradient(codes)[1:-1]
     variances = np.maximum((coarseness * widths) ** 2 / 12.0, 1e-16)
     design = np.stack([levels, np.ones_like(levels)], axis=1) / variances[:, None]
-    return NoiseModel(*_non_negative(design, np.ones_like(levels)))
+    return NoiseModel(*map(float, optimize.nnls(design, np.ones_like(levels))[0]))
 
 
 def grain_of(
@@ -167,17 +167,7 @@ def _fit(
     slope = offset = 0.0
     for _ in range(12):
         weight = np.sqrt(counts * trust) / np.maximum(model, 1e-16)
-        slope, offset = _non_negative(np.stack([levels * weight, weight], axis=1), variances * weight)
+        slope, offset = optimize.nnls(np.stack([levels * weight, weight], axis=1), variances * weight)[0]
         model = np.maximum(slope * levels + offset, 1e-16)
         trust = np.minimum(1.0, chance / np.maximum((variances - model) / model, chance)) ** 2
-    return NoiseModel(slope, offset)
-
-
-def _non_negative(design: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[float, float]:
-    """Least squares with both coefficients not negative: the best of the three corners."""
-    slope, offset = np.linalg.lstsq(design, target, rcond=None)[0]
-    if slope >= 0 and offset >= 0:
-        return float(slope), float(offset)
-    only = [float(np.dot(c, target) / max(np.dot(c, c), 1e-300)) for c in design.T]
-    errors = [float(np.sum((target - c * max(k, 0.0)) ** 2)) for c, k in zip(design.T, only, strict=True)]
-    return (max(only[0], 0.0), 0.0) if errors[0] < errors[1] else (0.0, max(only[1], 0.0))
+    return NoiseModel(float(slope), float(offset))

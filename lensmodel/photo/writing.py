@@ -387,38 +387,25 @@ def packed_opcodes(steps: list[Opcode]) -> bytes:
 
 
 def demosaiced(steps: list[Opcode], cfa: BayerPattern | None) -> tuple[list[Opcode], list[Opcode]]:
-    """Rewrite the steps of OpcodeList2, which are for a mosaic, for an image of three colours.
+    """Rewrite the steps of OpcodeList2, which are for a mosaic, for planes; and those that are lost.
 
-    A gain map of every second pixel of a mosaic is that of a colour; of the two greens the mean is taken.
+    A gain map of every second pixel is that of a colour; each of the two of green gives its square root.
     """
-    kept, lost, green = list[Opcode](), list[Opcode](), -1
+    kept, lost = list[Opcode](), list[Opcode]()
     for step in steps:
-        mapped = _gain_of_colours(step, cfa) if step.number == _GAIN_MAP else None
-        if mapped is None:
+        known = step.number == _GAIN_MAP and len(step.data) >= _GAIN_HEAD.size
+        head = _GAIN_HEAD.unpack_from(step.data) if known else (0,) * 15
+        (top, left, bottom, right), pitch, gains = head[:4], head[6:8], step.data[_GAIN_HEAD.size :]
+        if pitch == (2, 2) and cfa is not None:
+            colour = cfa[top % 2][left % 2]
+            if colour == 1:
+                gains = np.sqrt(np.frombuffer(gains[: len(gains) // 4 * 4], ">f4")).astype(">f4").tobytes()
+            # the two rows and columns between whose pixels the others stood
+            area = (top - top % 2, left - left % 2, bottom + bottom % 2, right + right % 2, colour, 1)
+        elif pitch == (1, 1):
+            area = (top, left, bottom, right, 0, 3)
+        else:
             lost.append(step)
             continue
-        colour, whole = mapped
-        if colour == 1 and green >= 0 and len(kept[green].data) == len(whole.data):
-            pair = kept[green], whole
-            gains = [np.frombuffer(each.data, ">f4", offset=_GAIN_HEAD.size).astype(float) for each in pair]
-            mean = ((gains[0] + gains[1]) / 2.0).astype(">f4").tobytes()
-            kept[green] = whole._replace(data=kept[green].data[: _GAIN_HEAD.size] + mean)
-            continue
-        green = len(kept) if colour == 1 else green
-        kept.append(whole)
+        kept.append(step._replace(data=_GAIN_HEAD.pack(*area, 1, 1, *head[8:]) + gains))
     return kept, lost
-
-
-def _gain_of_colours(step: Opcode, cfa: BayerPattern | None) -> tuple[int | None, Opcode] | None:
-    """Return the colour that a gain map of a mosaic is for, None for all, and the map for planes."""
-    if len(step.data) < _GAIN_HEAD.size:
-        return None
-    top, left, bottom, right, _, _, *pitch, across, down = _GAIN_HEAD.unpack_from(step.data)[:10]
-    colour = cfa[top % 2][left % 2] if pitch == [2, 2] and cfa is not None else None
-    if colour is None and pitch != [1, 1]:
-        return None
-    if colour is not None:  # the two rows and columns between whose pixels the others stood
-        top, left, bottom, right = top - top % 2, left - left % 2, bottom + bottom % 2, right + right % 2
-    planes = (0, 3) if colour is None else (colour, 1)
-    area = struct.pack(">10I", top, left, bottom, right, *planes, 1, 1, across, down)
-    return colour, step._replace(data=area + step.data[len(area) :])

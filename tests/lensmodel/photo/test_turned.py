@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from PIL import Image
 from lab.kernels import gaussian
 from lensmodel import photo
 from lensmodel.api import _Posteriors
-from lensmodel.blind.sampling import find_patches, load_developed, save_developed
+from lensmodel.blind.sampling import find_patches
 from lensmodel.core.errors import TurnedPixelsError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -40,20 +39,6 @@ def test_what_a_program_turned_is_not_learned_from_and_the_reason_is_said(
     assert any("turned its pixels" in remark for remark in developed.remarks)
     with pytest.raises(TurnedPixelsError, match="give the file as the camera wrote it"):
         find_patches(developed, count=4)
-
-
-@pytest.mark.parametrize(("turns", "turned"), [(None, True), (0, False), (3, False)])
-def test_what_earlier_versions_developed_is_still_known_to_be_turned(
-    turns: int | None, turned: bool, tmp_path: Path
-) -> None:
-    written(tmp_path / "x.jpg", 200, 300, {0x0110: "T-1"})
-    save_developed(photo.develop(tmp_path / "x.jpg"), tmp_path)
-    stored = json.loads((tmp_path / "photo.json").read_text())
-    del stored["info"]["turned"]
-    stored["info"]["turns"] = turns
-    (tmp_path / "photo.json").write_text(json.dumps(stored))
-
-    assert load_developed(tmp_path).info.turned == turned
 
 
 @pytest.mark.parametrize(

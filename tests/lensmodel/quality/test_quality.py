@@ -217,24 +217,6 @@ def test_photographed_chart_agrees_with_the_kernels_own_mtf() -> None:
     assert table["corner"].mtf_max < 1.01
 
 
-def test_measuring_skips_boxes_without_an_edge_and_says_when_none_is_left(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    plane = np.full((200, 200), 0.5)
-    plane[:100, :80] = blurred_edge(1.0, 5.0)
-    found = measure_edges(plane, [(0, 0, 100, 80), (100, 100, 90, 90)])
-
-    assert len(found) == 1
-    assert "no edge" in caplog.text
-    with pytest.raises(NotEnoughEvidenceError, match="none of the 1"):
-        measure_edges(plane, [(100, 100, 90, 90)])
-    with pytest.raises(InvalidInputError, match="leaves the frame"):
-        measure_edges(plane, [(150, 150, 90, 90)])
-    between = by_zone(found)[found[0].zone]  # halfway from across the radius to along it: neither T nor S
-    assert math.isnan(between.sagittal_mtf50)
-    assert math.isnan(between.tangential_mtf50)
-
-
 def test_delta_kernel_passes_everything() -> None:
     kernel = delta(15)
 

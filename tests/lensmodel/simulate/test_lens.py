@@ -253,13 +253,10 @@ def test_drawn_lenses_have_realistic_widths(kind: str) -> None:
     for seed in (11, 12):
         drawn = draw_lens(seed, kind)
         center = rms_width(drawn.kernel(CENTER))
-        corner = np.mean(
-            [rms_width(drawn.kernel(FieldPosition(0.95, phi))) for phi in (0.6, 2.5, -2.5, -0.6)]
-        )
+        corners = [rms_width(drawn.kernel(FieldPosition(0.95, phi))) for phi in (0.6, 2.5, -2.5, -0.6)]
 
         assert 0.2 < center < 1.6
-        assert 0.5 < corner < 5.0
-        assert corner > center
+        assert max(0.5, center) < np.mean(corners) < 5.0
 
 
 @pytest.mark.parametrize(

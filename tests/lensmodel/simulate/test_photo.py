@@ -14,7 +14,6 @@ import rawpy
 from numpy.typing import NDArray
 from PIL import Image
 
-from lab.scenes import dead_leaves
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
 from lensmodel.core.psf import centroid
 from lensmodel.core.types import Frame, Kernel, LensSettings, Planes, zone_of
@@ -291,19 +290,6 @@ def test_chart_has_edges_of_both_directions_in_every_zone_and_all_corners() -> N
 def test_chart_refuses_frames_that_are_too_small() -> None:
     with pytest.raises(InvalidInputError, match="at least"):
         edge_chart(Frame(200, 300))
-
-
-def test_dead_leaves_cover_everything_with_sharp_edges_and_a_natural_spectrum() -> None:
-    scene = dead_leaves(160, 200, np.random.default_rng(5))
-    spectrum = np.abs(np.fft.fft2(scene[1] - scene[1].mean())) ** 2
-    f = np.hypot(np.fft.fftfreq(160)[:, None], np.fft.fftfreq(200)[None, :])
-    low, high = spectrum[(f > 0.03) & (f < 0.06)].mean(), spectrum[(f > 0.12) & (f < 0.24)].mean()
-    slope = math.log(low / high) / math.log(4.0)
-
-    assert scene.shape == (3, 160, 200)
-    assert scene.min() >= 0.02
-    assert scene.max() <= 0.95
-    assert 1.2 < slope < 3.5
 
 
 @pytest.mark.parametrize("name", DEMO_SCENES)

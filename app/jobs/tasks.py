@@ -220,14 +220,12 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     `about` has the name of the lens and the shape of its photos.
     """
     model, about = LensModel.fit(read_samples(folder)), arguments["about"]
-    lateral = [from_json(LateralColour, stored) for stored in about["lateral"]]
     try:
         report = lens_report(
             model,
             about["name"],
             aspect=about["aspect"],
             height_px=about["height_px"],
-            lateral=lateral,
             on_step=progress,
         )
     except LensModelError as refusal:

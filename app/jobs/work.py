@@ -529,7 +529,6 @@ def measure(context: JobContext, lens_id: str, version: int) -> None:
         "name": _name(lens, "Unknown lens"),
         "aspect": width / height,
         "height_px": height if height > 2 else None,
-        "lateral": lenses.lateral_of(lens),
     }
     with context.task("measure", None, newest, samples=samples, about=about) as (metrics, folder):
         context.keep(report_key(lens_id, version, state.rebuild_epoch), folder / REPORT)

@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -23,7 +24,14 @@ from typing import Annotated, Any, Final
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from lensmodel.core import types
@@ -94,7 +102,7 @@ class Display:
     def progress_line(self, text: str, seconds: float) -> None:
         """Tell a step of long work, with the time since its start, on standard error."""
         if not self.quiet:
-            typer.echo(f"[{clock(seconds):>5}] {text}", err=True)
+            typer.echo(f"[{clock(seconds)}] {text}", err=True)
 
     def error(self, text: str) -> None:
         """Tell what went wrong."""
@@ -127,11 +135,11 @@ class Bar(Progress):
         **given: Any,  # noqa: ANN401 - as `Progress` takes them
     ) -> None:
         words = TextColumn("{task.description}", markup=False)  # names of files may hold brackets
-        columns = words, BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
-        super().__init__(*columns, TextColumn("{task.fields[left]}"), **given)
-        self._say, self._every_s = say, every_s
-        self._last = self.get_time()
-        self.add_task(text, total=total, left="")
+        super().__init__(
+            words, BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn(), **given
+        )
+        self._say, self._every_s, self._last = say, every_s, self.get_time()
+        self.add_task(text, total=total)
         (self._task,) = self.tasks
 
     def show(self, **changes: Any) -> None:  # noqa: ANN401 - as `Progress.update` takes them
@@ -143,15 +151,10 @@ class Bar(Progress):
         if "completed" in changes:
             changes["completed"] = max(changes["completed"], task.completed)
         self.update(task.id, **changes)
-        # photos that an earlier run has done are passed in no time, which says nothing of the others
-        early = (task.elapsed or 0.0) < 2.0 * self.speed_estimate_period
-        left = "" if early or task.time_remaining is None else clock(task.time_remaining)
-        task.fields["left"] = left and f"ETA {left}"
         if self._say is not None and self.get_time() - self._last >= self._every_s:
             self._last = self.get_time()
             done = f" {task.percentage:3.0f} %" if task.total else ""
-            ahead = left and f", about {left} left"
-            self._say(f"[{clock(task.elapsed or 0.0)}]{done} {task.description or 'working'}{ahead}")
+            self._say(f"[{clock(task.elapsed or 0.0)}]{done} {task.description or 'working'}")
 
     def part(self, number: int, done: int, total: int, **changes: Any) -> None:  # noqa: ANN401 - as `show` takes them
         """Show that photo `number` is done as far as `done` of `total`."""
@@ -159,10 +162,8 @@ class Bar(Progress):
 
 
 def clock(seconds: float) -> str:
-    """Write a time as 4:07, or 1:04:07 from an hour on."""
-    minutes, rest = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    """Write a time as 0:04:07."""
+    return str(timedelta(seconds=int(seconds)))
 
 
 def gain_words(gain: float | None) -> str:

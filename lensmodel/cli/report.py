@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
 from lensmodel import quality
-from lensmodel.api import lateral_of
 from lensmodel.cli import console, files
 from lensmodel.cli.console import Display, UsageError
 from lensmodel.core.files import to_json, write_atomically
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.psf import rms_width
 from lensmodel.core.types import ZONE_WORDS, FieldPosition, LensSettings, zone_of
-from lensmodel.photo import develop
 from lensmodel.report import (
     LensReport,
     compare,
@@ -50,10 +48,6 @@ def report(
     ] = None,
     aperture: Aperture = None,
     against: Annotated[Path | None, typer.Option(help="Profile of another copy to compare with.")] = None,
-    photo: Annotated[
-        list[Path] | None,
-        typer.Option(help="A photo of the lens whose lateral colour is measured; again for more; needs -o."),
-    ] = None,
     force: console.Force = False,
 ) -> None:
     """Say how sharp a lens is, and whether it is centred.
@@ -68,19 +62,15 @@ def report(
 
         lensmodel report my-24mm.lensprofile -o my-24mm.pdf
 
-        lensmodel report my-24mm.lensprofile --photo one.dng -o with-lateral-colour
-
         lensmodel report my-24mm.lensprofile --against a-friends-24mm.lensprofile
 
     Exit status: 0 reported, 1 the profile cannot be used, 2 wrong usage.
     """
     shown, targets = Display(), _targets(output)
-    if photo and output is None:
-        raise UsageError("--photo needs --output: what it adds is written to files")
     files.refuse_existing(*targets, force=force)
     with shown.progress("computing its PSFs at 200 places"):
-        found = measured(profile, aperture, photo or [], whole=output is not None)
-        compared = None if against is None else compare(found, measured(against, aperture, [], whole=False))
+        found = measured(profile, aperture, whole=output is not None)
+        compared = None if against is None else compare(found, measured(against, aperture, whole=False))
     if output is not None:
         with shown.progress("drawing"):
             for target in targets:
@@ -92,7 +82,7 @@ def report(
     shown.result("\n".join([*lines, *([] if output is None else [f"written: {output}"])]))
 
 
-def measured(profile: Path, aperture: float | None, photos: Sequence[Path], *, whole: bool) -> LensReport:
+def measured(profile: Path, aperture: float | None, *, whole: bool) -> LensReport:
     """Report on the lens of a profile: whole, in all colours, or only what the screen shows."""
     known = files.profile_at(profile)
     with files.as_usage():
@@ -101,7 +91,6 @@ def measured(profile: Path, aperture: float | None, photos: Sequence[Path], *, w
             known.model,
             name_of(known.lens) or profile.stem,
             apertures=asked,
-            lateral=[lateral_of(develop(path)) for path in photos],
             channels=("g", "r", "b") if whole else ("g",),
             details=provenance(
                 known.lens.get("serial"),

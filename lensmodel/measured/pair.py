@@ -40,7 +40,6 @@ from lensmodel.measured.measurer import (
     Window,
     window_corners,
     window_psf,
-    window_terms,
 )
 from lensmodel.measured.registration import CLEAR, Warp, match, matched
 from lensmodel.photo import LinearPhoto
@@ -60,7 +59,6 @@ _RINGS: Final = 16  # of 0 to 0.5 cycles/pixel: a window has few frequencies for
 # Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least
 # error for the lens of development (third order, 4). Measured once, no command repeats it
 _ALIASED: Final = 0.03
-_SMOOTH_PX: Final = 6.0  # pixels: slower changes are light, not detail (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +119,10 @@ class AperturePair(Measurer):
         """PSF of one window."""
         around = size // 2
         scene = _Scene(closed, warp, window, around)
-        light = _falloff(window, scene, around)
 
         def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
             cut = around - margin
-            whole = scene.moved(shift) * light
+            whole = scene.moved(shift)
             return whole[cut : whole.shape[0] - cut, cut : whole.shape[1] - cut]
 
         noise = scene.noise(size) - scene.alias(latent((0.0, 0.0), 0), size)
@@ -227,22 +224,6 @@ def _power_by_frequency(window: NDArray[np.floating]) -> Callable[[NDArray[np.fl
     mean = np.maximum(total / np.bincount(ring[inside], minlength=_RINGS), 1e-12)
     at = np.log(0.5 * (edges[1:] + edges[:-1]))
     return lambda f: np.exp(np.interp(np.log(np.maximum(f, 1e-3)), at, np.log(mean)))
-
-
-def _falloff(window: Window, scene: _Scene, around: int) -> NDArray[np.float64]:
-    """How much darker or brighter the open photo is than the closed one: a quadratic in row and column."""
-    side, good = len(window.light), window.require_measured()
-    basis = window_terms(side, around)
-    # smoothed, the two differ by the light alone, however one of them is blurred
-    smooth = ndimage.gaussian_filter(scene.moved((0.0, 0.0)), _SMOOTH_PX)
-    inner = slice(around, around + side)
-    columns = (basis[inner, inner] * smooth[inner, inner, None])[good]
-    terms, *_ = np.linalg.lstsq(columns, window.light[good], rcond=None)
-    light = basis @ terms
-    level = float(light[inner, inner].mean())
-    if not level > 0.0:
-        raise NotEnoughEvidenceError("a window of the open photo is black")
-    return np.asarray(np.maximum(light / level, 0.1))
 
 
 def _detailed(

@@ -171,17 +171,11 @@ def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
 
 
 def to_csv(report: LensReport) -> str:
-    """Write a report as CSV: MTF50 over the picture, contrast by radius, centring, lateral colour."""
+    """Write a report as CSV: MTF50 over the picture, contrast by radius, centring."""
     out = io.StringIO()
     writer = csv.DictWriter(out, _HEAD, restval="", lineterminator="\n")
     writer.writeheader()
     rows = [row for found in report.tested for row in _rows(found)]
-    if report.lateral is not None:
-        for channel, values in (("r", report.lateral.red), ("b", report.lateral.blue)):
-            rows += [
-                {"quantity": "lateral colour", "channel": channel, "unit": "px", "r": r, "value": value}
-                for r, value in zip(report.lateral.radii, values, strict=True)
-            ]
     for row in rows:
         writer.writerow(
             {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items() if v is not None}

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
-from statistics import median
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
@@ -36,7 +35,6 @@ from lensmodel.core.types import (
 )
 from lensmodel.measured import is_measured
 from lensmodel.model import LensModel, PsfAnswer
-from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import crossing, mtf50_from_kernel, mtf_from_kernel
 from lensmodel.report.centring import Centring, centring, direction_in_words
 
@@ -57,7 +55,6 @@ _FREQUENCIES: Final = (0.05, 0.1, 0.15, 0.2)
 RADII: Final = tuple(float(r) for r in np.linspace(0.0, 0.95, 11).round(4))
 _ROUND: Final = 1.05  # of the hull of measured places, which a figure may lie beyond (chosen)
 _RING: Final = 2  # places in each quarter of a ring whose mean is its value (chosen: for time)
-_LATERAL_R: Final = tuple(round(0.1 * k, 1) for k in range(11))  # half-diagonals (chosen: curves are smooth)
 # Shares of the centre's MTF50 above which a place is called as sharp, nearly as sharp, and clearly softer
 # (chosen: a fifth less is hardly seen in a print, half as much at a glance)
 _EVEN: Final = 0.95
@@ -214,16 +211,6 @@ class ApertureReport:
 
 
 @dataclass(frozen=True, slots=True)
-class LateralColourCurve:
-    """Pixels outwards by which red and blue images lie beyond the green one, by radius."""
-
-    radii: tuple[float, ...]
-    red: tuple[float, ...]
-    blue: tuple[float, ...]
-    photos: int  # that show it
-
-
-@dataclass(frozen=True, slots=True)
 class LensReport:
     """A whole report."""
 
@@ -233,7 +220,6 @@ class LensReport:
     places: int  # at which these show the blur, in the colour that most of them show
     sensor: SensorGeometry  # for other units than cycles/pixel
     tested: tuple[ApertureReport, ...]  # by aperture, ascending, and by colour, green first
-    lateral: LateralColourCurve | None  # None where no photo showed it
     # what else stands on the page: camera, serial, names of photos
     details: Mapping[str, str] = field(default_factory=dict)
     measured: bool = False  # whether photos of charts, targets or points alone tell of the lens
@@ -323,7 +309,6 @@ def lens_report(
     *,
     aspect: float | None = None,
     height_px: int | None = None,
-    lateral: Sequence[LateralColour] = (),
     channels: Sequence[Channel] = ("g", "r", "b"),
     apertures: Sequence[float] | None = None,
     rows: int = ROWS,
@@ -334,8 +319,8 @@ def lens_report(
     """Report on a lens at the apertures of its photos, or at those that are given.
 
     Unless they are given, the aspect (width over height) of its photos and their height in pixels are what
-    its samples come to. `lateral` is what its photos show of lateral colour, `rows` counts those of the maps,
-    `size` is the odd side of the kernels in pixels, `details` are shown as they are.
+    its samples come to. `rows` counts those of the maps, `size` is the odd side of the kernels in pixels,
+    `details` are shown as they are.
     """
     aspect = filled_aspect(model) if aspect is None else aspect
     cols = max(3, round(rows * aspect))
@@ -379,7 +364,6 @@ def lens_report(
         places=places_of(model.samples),
         sensor=SensorGeometry(pitch, height_px),
         tested=tuple(tested),
-        lateral=_lateral(lateral),
         details=dict(details or {}),
         measured=measured,
     )
@@ -536,20 +520,6 @@ def _frequencies(pitch_um: float | None) -> list[tuple[float, float | None]]:
     step = next((step for step in _STEPS_MM if 4.0 * step <= nyquist / 2.0), _STEPS_MM[-1])
     pairs = [(k * step * pitch_um / 1000.0, k * step) for k in range(1, 5)]
     return [(f, lp) for f, lp in pairs if f <= NYQUIST]
-
-
-def _lateral(measured: Sequence[LateralColour]) -> LateralColourCurve | None:
-    """Median displacement over the photos that could tell: one without edges cannot spoil it."""
-    red = [each for each in measured if each.red_points > 0]
-    blue = [each for each in measured if each.blue_points > 0]
-    if not red or not blue:
-        return None
-    return LateralColourCurve(
-        _LATERAL_R,
-        tuple(median(each.displacement(r, "r") for each in red) for r in _LATERAL_R),
-        tuple(median(each.displacement(r, "b") for each in blue) for r in _LATERAL_R),
-        min(len(red), len(blue)),
-    )
 
 
 def compare(first: LensReport, second: LensReport) -> str:

@@ -14,11 +14,9 @@ import numpy as np
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Channel
-from lensmodel.report.export import place_table
 from lensmodel.report.lens_report import (
     NYQUIST,
     ApertureReport,
-    LateralColourCurve,
     LensReport,
     Unit,
 )
@@ -32,7 +30,6 @@ try:
     from matplotlib.image import AxesImage
     from matplotlib.patches import Circle, Rectangle
     from matplotlib.ticker import MaxNLocator
-    from matplotlib.transforms import Bbox
 except ModuleNotFoundError as error:
     raise InvalidInputError("drawing needs matplotlib: pip install 'lensmodel[report]'") from error
 
@@ -58,7 +55,7 @@ _LETTERS: Final = 34  # of a legend beside each other (chosen: they fit in what 
 _PAGE: Final = (8.27, 11.69)  # inches: A4
 _LEFT: Final = 0.07  # of the width of a page: where its lines begin (chosen)
 _LETTERS_OF_A_LINE: Final = 1020.0  # over the size in points: of DejaVu Sans, narrower than the page (chosen)
-_A_PAGE: Final = 4  # panels below each other on a page (chosen: as wide as single charts)
+_A_PAGE: Final = 4  # panels below each other on a page: those of one aperture
 _IN_CELL: Final[dict[str, Any]] = {"ha": "center", "va": "center", "fontsize": 7.0}  # figures on a map
 _HATCHED: Final[dict[str, Any]] = {"facecolor": "#f4f4f2", "edgecolor": "#a8a8a2", "hatch": "////", "lw": 0}
 _LUMA: Final = (0.2126, 0.7152, 0.0722)  # of red, green and blue (ITU-R BT.709)
@@ -108,10 +105,10 @@ Panel = tuple[str, Callable[[Place], None]]  # Title of a drawing, and what draw
 
 
 def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> list[Chart]:
-    """All charts of one aperture, those over apertures and of lateral colour last."""
+    """All charts of one aperture, that over apertures last."""
     drawn = []
     with mpl.rc_context(_STYLE):
-        for title, draw in _panels(report, report.at(aperture), unit):
+        for title, draw in [*_panels(report, report.at(aperture), unit), *_by_aperture(report, unit)]:
             figure, out = Figure(figsize=_CHART, layout="constrained"), io.BytesIO()
             _draw(figure, title, draw)
             figure.savefig(out, format="svg", metadata={"Date": None})
@@ -120,19 +117,16 @@ def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> l
 
 
 def pages(report: LensReport) -> list[Figure]:
-    """Draw what a photographer shows around on one page, and some for testers for each aperture."""
+    """Draw what a photographer shows around on one page, and for testers one for each aperture."""
+    panels = [panel for found in report.green for panel in _panels(report, found, "c/px")]
+    panels += _by_aperture(report, "c/px")
     with mpl.rc_context(_STYLE):
         drawn = [_photographer(report)]
-        for found in report.green:
-            panels = [
-                *_panels(report, found, "c/px"),
-                (f"MTF50 by place{_at(found)}", _on(_table, report, found)),
-            ]
-            for first in range(0, len(panels), _A_PAGE):
-                figure = Figure(figsize=_PAGE)
-                top = _written(figure, 0.97, report.name, 15.0, weight="bold")
-                _fill(figure, panels[first : first + _A_PAGE], [1.0] * _A_PAGE, 0.02, top)
-                drawn.append(figure)
+        for first in range(0, len(panels), _A_PAGE):
+            figure = Figure(figsize=_PAGE)
+            top = _written(figure, 0.97, report.name, 15.0, weight="bold")
+            _fill(figure, panels[first : first + _A_PAGE], [1.0] * _A_PAGE, 0.02, top)
+            drawn.append(figure)
     return drawn
 
 
@@ -160,7 +154,7 @@ def to_png(figure: Figure) -> bytes:
 def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel]:
     """What a tester is shown of one aperture."""
     at = _at(found)
-    panels: list[Panel] = [
+    return [
         (f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor.units.get(unit, 1.0))),
         (
             f"Contrast from the centre to the corner{at}: sagittal (S) solid, tangential (T) dashed",
@@ -169,11 +163,12 @@ def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel
         (f"Contrast by colour{at}", _on(_colours, report, found.settings.aperture)),
         (f"Centring{at}", _on(_side_softer, found)),
     ]
-    if len(report.apertures) > 1:
-        panels.append(("MTF50 by aperture", _on(_over_apertures, report, unit)))
-    if report.lateral is not None:
-        panels.append(("Lateral colour", _on(_lateral_colour, report.lateral)))
-    return panels
+
+
+def _by_aperture(report: LensReport, unit: Unit) -> list[Panel]:
+    """What a tester is shown of all apertures together."""
+    several = len(report.apertures) > 1
+    return [("MTF50 by aperture", _on(_over_apertures, report, unit))] if several else []
 
 
 def _on(draw: Callable[..., None], *given: Any) -> Callable[[Place], None]:  # noqa: ANN401 - what it draws
@@ -303,7 +298,7 @@ def _contrast(ax: Axes, found: ApertureReport) -> None:
     for ink, curve in zip(_INKS, found.curves, strict=False):
         ax.plot(found.radii, curve.sagittal, color=ink, ls="-", label=f"{curve.name} S")
         ax.plot(found.radii, curve.tangential, color=ink, ls="--", label=f"{curve.name} T")
-    _radial(ax, "contrast", 1.0)
+    _over_the_radius(ax)
 
 
 def _colours(ax: Axes, report: LensReport, aperture: float | None) -> None:
@@ -313,7 +308,7 @@ def _colours(ax: Axes, report: LensReport, aperture: float | None) -> None:
         curve = found.curves[min(1, len(found.curves) - 1)]
         both = np.mean([curve.tangential, curve.sagittal], axis=0)
         ax.plot(found.radii, both, color=ink, label=f"{name}, {curve.name}")
-    _radial(ax, "contrast", 1.0)
+    _over_the_radius(ax)
 
 
 def _side_softer(ax: Axes, found: ApertureReport) -> None:
@@ -335,26 +330,6 @@ def _side_softer(ax: Axes, found: ApertureReport) -> None:
     ax.set_xlabel("arrow: to the softer side; circle: two standard errors")
 
 
-def _table(ax: Axes, report: LensReport, found: ApertureReport) -> None:
-    """MTF50 of one aperture by place, in each unit that is known."""
-    ax.set_axis_off()
-    head, rows = place_table(report)
-    lines = [[cell.replace(" [", "\n[").replace(" (", "\n(") for cell in row[1:]] for row in rows
-             if row[0] == (found.at or "unknown")]  # fmt: skip
-    table = ax.table(
-        lines,
-        colLabels=head[1:],
-        cellLoc="left",
-        colLoc="left",
-        edges="horizontal",
-        bbox=Bbox.unit(),
-    )
-    table.auto_set_font_size(False)
-    table.set_fontsize(6.2)
-    for cell in table.get_celld().values():
-        cell.set(linewidth=0.4, edgecolor=_GREY)
-
-
 def _over_apertures(ax: Axes, report: LensReport, unit: Unit) -> None:
     """MTF50 of the centre and of each corner by aperture."""
     known = [one for one in report.green if one.at]
@@ -368,15 +343,6 @@ def _over_apertures(ax: Axes, report: LensReport, unit: Unit) -> None:
     _legend(ax)
 
 
-def _lateral_colour(ax: Axes, shift: LateralColourCurve) -> None:
-    """By how much red and blue images lie outwards of the green one."""
-    ax.plot(shift.radii, shift.red, color=_CHANNELS["r"][1], label="red")
-    ax.plot(shift.radii, shift.blue, color=_CHANNELS["b"][1], label="blue")
-    ax.axhline(0.0, color=_CHANNELS["g"][1], lw=0.8)
-    reach = 1.2 * max(0.1, *(abs(v) for v in (*shift.red, *shift.blue)))
-    _radial(ax, "pixels outwards of green", reach, low=-reach)
-
-
 def _legend(ax: Axes) -> None:
     """Draw the legend below, where it is seen also where the right is cut off, as wide as it may be."""
     longest = max(len(label) for label in ax.get_legend_handles_labels()[1])
@@ -384,7 +350,7 @@ def _legend(ax: Axes) -> None:
     ax.legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), ncols=columns)
 
 
-def _radial(ax: Axes, words: str, top: float, low: float = 0.0) -> None:
-    ax.set(xlim=(0.0, 1.0), ylim=(low, top), ylabel=words)
+def _over_the_radius(ax: Axes) -> None:
+    ax.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0), ylabel="contrast")
     ax.set_xlabel("0 centre, 1 corner", loc="right")
     _legend(ax)

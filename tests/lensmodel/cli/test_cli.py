@@ -27,7 +27,6 @@ import rawpy
 import tifffile
 from deadline import Deadline, stretched
 from PIL import ExifTags, Image
-from rich.progress import Task
 from running import SMALL, lens_of_one_blur, scene, write_photo
 from scipy import ndimage
 from typer.testing import CliRunner
@@ -450,7 +449,7 @@ def test_demo_renews_what_an_earlier_demo_left_and_no_folder_of_others_unless_fo
     first, second = here("demo", "-o", "out"), here("demo", "-o", "out")
     assert first.returncode == second.returncode == 0
     assert second.stdout.strip() == "run 2"
-    assert first.stderr.splitlines() == ["[ 0:00] working"]
+    assert first.stderr.splitlines() == ["[0:00:00] working"]
 
     (folder / "out" / "mine.txt").write_text("my notes", encoding="utf-8")
     refused = here("demo", "-o", "out")
@@ -626,15 +625,12 @@ def on_a_terminal(here: Here, monkeypatch: pytest.MonkeyPatch) -> Seen:
     return run
 
 
-def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(
-    on_a_terminal: Seen, monkeypatch: pytest.MonkeyPatch
+def test_progress_is_on_a_terminal_and_results_are_in_the_pipe(
+    on_a_terminal: Seen,
 ) -> None:
-    monkeypatch.setattr(Task, "time_remaining", 83.0)  # the photo is too quick for any to be told
-    monkeypatch.setattr(Task, "elapsed", 61.0)
     said, seen = on_a_terminal("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
 
     assert said.splitlines() == [str(Path("out/one-corrected.tif"))]
-    assert "ETA 1:23" in seen
     assert "one.dng" in seen
 
 

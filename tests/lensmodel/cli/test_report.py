@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tifffile
-from scipy import ndimage
 from typer.testing import CliRunner
 
 from lab.kernels import gaussian
@@ -155,29 +153,3 @@ def test_an_exported_stack_holds_the_answers_of_the_profile(folder: Path) -> Non
     first = model.query(FieldPosition(math.hypot(x, y), math.atan2(y, x)), LensSettings(aperture=2.0), 15)
     assert pages.shape == (6, 15, 15)
     assert pages[0] == pytest.approx(first.kernel, abs=1e-7)
-
-
-def test_lateral_colour_is_measured_on_a_photo_of_the_lens(folder: Path, green_alone: None) -> None:
-    rng = np.random.default_rng(4)
-    rows, cols = 400, 600
-    scene = np.full((rows, cols), 0.3)
-    for _ in range(400):
-        top, left = rng.integers(0, rows), rng.integers(0, cols)
-        scene[top : top + rng.integers(8, 60), left : left + rng.integers(8, 60)] = rng.uniform(0.1, 0.9)
-    scene = ndimage.gaussian_filter(scene, 0.8)
-    y, x = np.mgrid[:rows, :cols].astype(float)
-    middle = ((rows - 1) / 2.0, (cols - 1) / 2.0)
-    larger = 1.005  # the red picture, by which its corner lies 1.8 px further out
-    places = [m + (p - m) / larger for p, m in zip((y, x), middle, strict=True)]
-    red = ndimage.map_coordinates(scene, places, order=3, mode="nearest")
-    picture = np.stack([red, scene, scene], axis=-1) + rng.normal(0.0, 0.002, (rows, cols, 3))
-    tifffile.imwrite("fringes.tif", np.uint16(65535 * np.clip(picture, 0, 1)), photometric="rgb")
-
-    run("report", NAME, "-o", "report", "--photo", "fringes.tif")
-
-    found = json.loads(Path("report/report.json").read_text())["lateral"]
-    assert found["photos"] == 1
-    assert found["red"][-1] == pytest.approx(0.005 * math.hypot(rows, cols) / 2.0, abs=0.25)
-    assert abs(found["blue"][-1]) < 0.25
-    with pytest.raises(UsageError, match="--photo needs --output"):
-        CliRunner().invoke(app, ["report", NAME, "--photo", "fringes.tif"], catch_exceptions=False)

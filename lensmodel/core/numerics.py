@@ -100,3 +100,15 @@ def _largest_and_lift(a: NDArray[np.float64], smallest: float) -> tuple[float, f
 def _product(a: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
     """A k of a symmetric matrix; of a large one only a half is read."""
     return np.asarray(scipy.linalg.blas.dsymv(1.0, a.T, k) if len(a) > _FEW else a @ k)
+
+
+def on_simplex(values: NDArray[np.float64], total: float) -> NDArray[np.float64]:
+    """Nearest values that are not negative and have this sum.
+
+    Source: J. Duchi et al., "Efficient projections onto the l1-ball for learning in high dimensions",
+    ICML 2008, figure 1.
+    """
+    falling = np.sort(values)[::-1]
+    excess = (np.cumsum(falling) - total) / np.arange(1, len(values) + 1)
+    last = int(np.nonzero(falling > excess)[0][-1])
+    return np.asarray(np.maximum(values - excess[last], 0.0))

@@ -37,9 +37,10 @@ from scipy.sparse.csgraph import connected_components
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.files import atomic
+from lensmodel.core.numerics import on_simplex
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Channel, Kernel, StepHook
-from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared, Window, on_simplex, psf_at
+from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared, Window, psf_at
 from lensmodel.measured.target import on_paper
 from lensmodel.photo import LinearPhoto
 from lensmodel.quality import (

@@ -48,7 +48,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
-from lensmodel.core.numerics import fista, nonnegative_least_squares
+from lensmodel.core.numerics import fista, nonnegative_least_squares, on_simplex
 from lensmodel.core.psf import PsfSample, as_kernel, centred, centroid
 from lensmodel.core.types import (
     CHANNELS,
@@ -374,18 +374,6 @@ def _of_sum(
         steps=steps,
         still=_STILL * light,
     )
-
-
-def on_simplex(values: NDArray[np.float64], total: float) -> NDArray[np.float64]:
-    """Nearest values that are not negative and have this sum.
-
-    Source: J. Duchi et al., "Efficient projections onto the l1-ball for learning in high dimensions",
-    ICML 2008, figure 1.
-    """
-    falling = np.sort(values)[::-1]
-    excess = (np.cumsum(falling) - total) / np.arange(1, len(values) + 1)
-    last = int(np.nonzero(falling > excess)[0][-1])
-    return np.asarray(np.maximum(values - excess[last], 0.0))
 
 
 def prior_width(size: int) -> NDArray[np.float64]:

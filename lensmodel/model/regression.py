@@ -49,7 +49,7 @@ import scipy  # `spatial` is loaded where it is needed: it takes a second
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import NoSamplesError
-from lensmodel.core.numerics import jit
+from lensmodel.core.numerics import jit, on_simplex
 from lensmodel.core.psf import PsfSample, resized, second_moments
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies
@@ -381,16 +381,12 @@ class LocalKernels:
 def without_negatives(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """The nearest values that are not negative and have the same sum, of each row of (q, n).
 
-    They are lower by one amount, or zero. Clipping alone would keep the crests of a spline's ripples round a
-    sharp kernel and drop their troughs. Source: J. Duchi et al., "Efficient projections onto the l1-ball for
-    learning in high dimensions", ICML 2008, fig. 1.
+    Clipping alone would keep the crests of a spline's ripples round a sharp kernel and drop their troughs.
     """
     lowered = values.copy()
     for row in np.flatnonzero((values.min(axis=1) < 0.0) & (values.max(axis=1) > 0.0)):
-        falling, total = np.sort(values[row])[::-1], values[row].sum()
-        excess = np.cumsum(falling) - (total if total > 0.0 else falling[0])
-        count = np.flatnonzero(falling * np.arange(1, falling.size + 1) > excess)[-1] + 1
-        lowered[row] = np.maximum(values[row] - excess[count - 1] / count, 0.0)
+        total = float(values[row].sum())
+        lowered[row] = on_simplex(values[row], total if total > 0.0 else float(values[row].max()))
     return lowered
 
 

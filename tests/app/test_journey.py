@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import os
 import shutil
 import signal
@@ -39,7 +38,7 @@ def at_work(job: dict[str, Any]) -> bool:
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Photos of one lens."""
     folder = tmp_path_factory.mktemp("photos")
-    for seed, name in enumerate(("first", "second", "third", "fourth", "fifth")):
+    for seed, name in {0: "first", 2: "third", 3: "fourth", 4: "fifth"}.items():
         shape = SHAPE if name in {"first", "third"} else SMALL  # what is shown of it, and what is corrected
         write_photo(folder / f"{name}.dng", seed, sigma=SIGMA, shape=shape)
     return folder
@@ -91,20 +90,6 @@ def test_a_photo_calibrates_its_lens_once(service: Service, first: dict[str, Any
     assert (again["id"], len(additions(service, first["lens_id"], first["id"]))) == (first["id"], 1)
     assert kernel.sum() == pytest.approx(1.0, abs=1e-4)
     assert rms_width(kernel) == pytest.approx(SIGMA, rel=0.25)
-
-
-def test_events_tell_the_way_of_a_photo_to_its_end(service: Service, photos: Path) -> None:
-    photo = service.upload(photos / "second.dng")
-    with service.http.stream(
-        "GET", f"/v1/jobs/{photo['id']}/events", timeout=stretched(PATIENCE_S)
-    ) as events:
-        assert events.headers["content-type"].startswith("text/event-stream")
-        seen = [json.loads(line[5:]) for line in events.iter_lines() if line.startswith("data:")]
-
-    done = [job["progress"]["done"] for job in seen]
-    assert seen[-1]["state"] == "succeeded"
-    assert done == sorted(done)
-    assert len(seen) > 2
 
 
 def test_a_stored_photo_is_corrected_sharper(service: Service, first: dict[str, Any], photos: Path) -> None:

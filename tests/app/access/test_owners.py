@@ -105,9 +105,7 @@ def requests(client: TestClient, ids: dict[str, str]) -> Iterator[tuple[str, str
         yield method, address, {**options, "params": {**options.get("params", {}), **needed}}
 
 
-def test_an_owner_finds_nothing_of_another_on_any_route(
-    guarded: TestClient, store: Store, steps: Steps
-) -> None:
+def test_no_route_shows_an_owner_things_of_another(guarded: TestClient, store: Store, steps: Steps) -> None:
     ids = furnish(guarded, steps, "anna")
     anna, ben = key_of(store, "anna"), key_of(store, "ben")
     secrets = {*ids.values(), "anna", "p1.dng", "EF24mm"}
@@ -185,9 +183,7 @@ def test_the_same_bytes_of_two_owners_are_two_photos(guarded: TestClient, store:
     assert guarded.get(f"/v1/photos/{second.json()['id']}", headers=ben).status_code == 200
 
 
-def test_every_route_but_probes_and_sign_in_needs_a_key(
-    guarded: TestClient, store: Store, steps: Steps
-) -> None:
+def test_all_but_probes_and_sign_in_needs_a_key(guarded: TestClient, store: Store, steps: Steps) -> None:
     ids = dict.fromkeys(("photo_id", "lens_id", "job_id", "correction_id"), "x")
     allowed: dict[str, set[str]] = {}
     for method, address, options in requests(guarded, ids):
@@ -330,9 +326,7 @@ def test_quotas_of_an_owner_go_before_the_settings(guarded: TestClient, store: S
 
 
 @pytest.mark.parametrize("open_to", [{"host": "0.0.0.0"}, {"allowed_hosts": "localhost"}])
-def test_what_others_can_reach_does_not_start_without_a_key(
-    settings: Settings, store: Store, open_to: dict[str, Any]
-) -> None:
+def test_an_open_port_needs_a_key(settings: Settings, store: Store, open_to: dict[str, Any]) -> None:
     open_settings = settings.model_copy(update=open_to)
 
     with pytest.raises(UsageError, match="lensmodel keys create"):
@@ -423,9 +417,7 @@ def send(client: TestClient) -> Any:
     return client.post("/v1/photos?filename=a.jpg", content=JPEG)
 
 
-def test_the_export_holds_every_row_and_file_of_the_owner_and_nothing_else(
-    client: TestClient, steps: Steps, storage: Storage
-) -> None:
+def test_the_export_holds_all_of_the_owner_alone(client: TestClient, steps: Steps, storage: Storage) -> None:
     photo, gone = steps.counted(), steps.receive()
     storage.put(photo.blob_key, b"mine")
     steps.owner = "other"
@@ -463,9 +455,7 @@ def test_an_archive_of_many_files_takes_time_in_proportion_to_them() -> None:
     assert seconds(25_000) < 12 * seconds(5_000)  # five times as many
 
 
-def test_erasure_leaves_no_row_and_file(
-    client: TestClient, store: Store, steps: Steps, storage: Storage
-) -> None:
+def test_erasure_leaves_nothing(client: TestClient, store: Store, steps: Steps, storage: Storage) -> None:
     steps.owner = "other"
     foreign = steps.counted()
     kept = (tables.OwnerRow, tables.PhotoRow, tables.LensRow, tables.EventRow, tables.SampleRow)
@@ -484,9 +474,7 @@ def test_erasure_leaves_no_row_and_file(
     assert client.get("/v1/photos").json()["items"] == []
 
 
-def test_a_killed_erasure_is_carried_through_by_a_worker(
-    store: Store, steps: Steps, storage: Storage
-) -> None:
+def test_a_worker_carries_a_killed_erasure_through(store: Store, steps: Steps, storage: Storage) -> None:
     photo = steps.counted()
     store.accounts.create_key("local", ["write"])
     key = store.accounts.begin_erasing("local")

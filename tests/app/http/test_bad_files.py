@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
-from running import LIGHT, Service, running, write_photo
+from running import LIGHT, running, write_photo
 
 from lensmodel.blind import sampling
-from lensmodel.core.errors import LensModelError
+from lensmodel.core.errors import LensModelError, NoUsablePatchesError
 from lensmodel.core.types import LensSettings
 from lensmodel.simulate import demo_data_path
 
@@ -40,21 +39,17 @@ def tiff(entries: list[tuple[int, int, int, int]], following: int = 0) -> bytes:
     return b"II*\0" + struct.pack("<IH", 8, len(entries)) + fields + struct.pack("<I", following)
 
 
-def thumbnail() -> bytes:
+def thumbnail() -> Image.Image:
     """A real photograph as small as a file's preview: sharp all over, and says nothing of a lens."""
-    target = io.BytesIO()
     with Image.open(demo_data_path("city.jpg")) as picture:
-        picture.resize((88, 64), Image.Resampling.LANCZOS).save(target, "JPEG", quality=95)
-    return target.getvalue()
+        return picture.resize((88, 64), Image.Resampling.LANCZOS)
 
 
-def one_window() -> bytes:
+def one_window() -> Image.Image:
     """Detail in one place only, as of a moth on a wall: one window of hundreds tells anything."""
     pixels = np.full((900, 1200), 120.0)
     pixels[400:500, 600:700] += 60.0 * np.random.default_rng(1).standard_normal((100, 100))
-    target = io.BytesIO()
-    Image.fromarray(np.clip(pixels, 0, 255).astype(np.uint8)).convert("RGB").save(target, "JPEG", quality=95)
-    return target.getvalue()
+    return Image.fromarray(np.clip(pixels, 0, 255).astype(np.uint8)).convert("RGB")
 
 
 OWN = {
@@ -77,23 +72,6 @@ OWN = {
 }
 
 
-def send_all(service: Service, files: dict[str, bytes]) -> dict[str, dict[str, Any]]:
-    """Send all files, wait until each has its answer; return the answers by name."""
-    answers, waiting = {}, {}
-    for name, content in files.items():
-        answer = service.http.post("/v1/photos", files={"file": (name, content)}, data=TOLD)
-        assert answer.status_code in {200, 202, 400, 413, 415, 422}, f"{name}: {answer.text}"
-        if answer.status_code < 300:
-            waiting[name] = answer.json()["id"]
-        else:
-            answers[name] = answer.json()
-    for name, photo_id in waiting.items():
-        service.job(photo_id)
-        photo = service.get(f"/v1/photos/{photo_id}")
-        answers[name] = photo["error"] or {"code": photo["state"], "detail": "done"}
-    return answers
-
-
 @pytest.mark.parametrize("name", OWN)
 def test_a_bad_file_is_refused_by_whoever_reads_it(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
@@ -108,24 +86,31 @@ def test_a_bad_file_is_refused_by_whoever_reads_it(name: str, tmp_path: Path) ->
         assert refusal.value.code in {"decompression_bomb", "image_too_large"}
 
 
-@pytest.mark.slow  # as the test before, which needs no service
+@pytest.mark.parametrize("photo", [thumbnail, one_window])
+def test_a_thumbnail_and_detail_in_one_place_tell_nothing(
+    photo: Callable[[], Image.Image], tmp_path: Path
+) -> None:
+    photo().save(tmp_path / "p.jpg", quality=95)
+    # the fewest patches of which as much evidence is asked as of the default
+    strict = sampling.configured("default", LensSettings(4.0), patch_count=18)
+
+    with pytest.raises(NoUsablePatchesError):
+        sampling.samples_of_photo(tmp_path / "p.jpg", strict)
+
+
+@pytest.mark.slow  # as the tests before, which need no service
 def test_bad_files_are_refused_and_a_good_photo_still_goes_through_in_the_same_worker(tmp_path: Path) -> None:
     limits = {"LENS_TASK_SECONDS": "5400", "LENS_WORKER_MEMORY_MB": "3000", "LENS_MAX_MEGAPIXELS": "50"}
     with running(tmp_path / "data", LIGHT, **limits) as service:
-        for name, problem in send_all(service, OWN).items():
+        for name, content in OWN.items():
+            answer = service.http.post("/v1/photos", files={"file": (name, content)}, data=TOLD)
+            problem = answer.json()
+            if answer.status_code < 300:
+                service.job(problem["id"])
+                problem = service.get(f"/v1/photos/{problem['id']}")["error"]
             assert problem["code"] in KNOWN_CODES, (name, problem)
             assert len(problem["detail"]) > 15, name
             assert "Traceback" not in problem["detail"], name
 
         assert service.calibrated(write_photo(tmp_path / "good.dng", 77))["state"] == "counted"
         assert "started again" not in service.log.read_text()
-
-
-@pytest.mark.slow
-def test_a_thumbnail_and_detail_in_one_place_do_not_count(tmp_path: Path) -> None:
-    # the fewest patches of which as much evidence is asked as of the default
-    with running(tmp_path / "data", LENS_PATCHES="18") as strict:
-        answers = send_all(strict, {"thumbnail.jpg": thumbnail(), "one_window.jpg": one_window()})
-
-        assert {answer["code"] for answer in answers.values()} == {"no_usable_patches"}
-        assert strict.get("/v1/lenses")["items"][0]["photos"] == 0

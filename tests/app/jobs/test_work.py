@@ -253,9 +253,7 @@ def test_a_reading_before_its_turn_holds_up_no_work_that_has_begun_and_ends_none
     assert bench.work(photo).state == state
 
 
-def test_only_photos_that_wait_and_were_not_read_are_read_before_their_turn(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_unread_photos_that_wait_are_read_ahead(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     photo, photos = bench.received(), bench.store.photos
     assert photos.unread() is None  # its turn may come at once
     monkeypatch.setattr("app.store.photos.SOON", timedelta(0))
@@ -439,6 +437,14 @@ def test_a_refusal_ends_the_photo_with_what_to_do_and_without_another_try(
     assert (failed.state, failed.error_code) == ("failed", code)
     assert says in failed.error_detail
     assert bench.sandbox.ran.count(task) == runs
+
+
+def test_too_few_patches_are_no_evidence(bench: Bench) -> None:
+    bench.context.settings = bench.context.settings.model_copy(update={"patches": 18})
+
+    failed = bench.work()
+
+    assert (failed.state, failed.error_code) == ("failed", "no_usable_patches")
 
 
 @pytest.mark.parametrize("task", ["inspect", "develop", "select", "estimate"])

@@ -8,14 +8,12 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from conftest import Steps
 from crew import CELLS, Crew, check_counts, databases, done_patches, pause, states
 from deadline import stretched, until
-from servers import postgres
 from sqlalchemy import exc, update
 from uploads import receive, send
 
@@ -23,7 +21,6 @@ from app.blobs.storage import Storage
 from app.jobs.worker import Worker
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.database import upgrade
 from app.store.tables import GarbageRow
 from lensmodel.cli.console import InterruptedByUser
 
@@ -276,28 +273,3 @@ def test_workers_that_start_while_the_storage_is_away_wait_for_it(
     assert "failed" not in seen
     assert left == []
     check_counts(store, 2)
-
-
-@pytest.mark.tools
-@pytest.mark.slow
-def test_photos_outlast_a_database_that_is_away(settings: Settings, tmp_path: Path) -> None:
-    with contextlib.ExitStack() as stack:
-        server = stack.enter_context(postgres())
-        addresses = {"database_url": server.url("app"), "storage_url": f"file://{tmp_path}/blobs"}
-        settings = settings.model_copy(update=addresses)
-        settings.data_dir.mkdir()
-        store = stack.enter_context(contextlib.closing(Store(settings)))
-        upgrade(store.database)
-        for number in range(6):
-            send(store, Storage(settings.storage), number)
-
-        crew = stack.enter_context(contextlib.closing(Crew(settings, settings.data_dir / "workers.log")))
-        worker = crew.hire()
-        crew.until(lambda: "estimating" in states(store))
-        server.stop()
-        time.sleep(9.0)  # long enough for three quick tries
-        server.start()
-        crew.until(lambda: are_counted(store))
-
-        assert worker.poll() is None
-        check_counts(store, 6)

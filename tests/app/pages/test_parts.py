@@ -521,9 +521,7 @@ def test_the_page_of_a_lens_follows_its_first_photos(client: TestClient, steps: 
     assert "A photo is being added." in part(client, "lens", lens).text
 
 
-def test_a_page_whose_work_has_ended_is_made_anew_whatever_its_photos_are_called(
-    client: TestClient, steps: Steps, store: Store
-) -> None:
+def test_a_page_whose_work_has_ended_is_made_anew(client: TestClient, steps: Steps, store: Store) -> None:
     photo, other = steps.planned(), steps.counted(filename='a hx-get="b".dng')
     row = steps.correct(other, **PNG8)
     open_pages = (("photo", photo.public_id), ("batch", row.public_id))

@@ -45,8 +45,9 @@ OPEN = {"/healthz", "/readyz", "/sign-in", "/v1/session"}
 
 
 @pytest.fixture
-def guarded(settings: Settings, store: Store) -> Iterator[TestClient]:
-    """Speak with a service that asks for keys."""
+def guarded(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
+    """Speak with a service that asks for keys, and looks for each request whether they are valid still."""
+    monkeypatch.setattr("app.access.FRESH_S", 0.0)
     closed = settings.model_copy(update={"auth": "keys"})
     with TestClient(create_app(closed), raise_server_exceptions=False) as opened:
         yield opened
@@ -230,10 +231,7 @@ def test_a_browser_signs_in_with_a_cookie_for_this_site_alone(guarded: TestClien
     assert guarded.get("/v1/account", headers=shown).status_code == 401
 
 
-def test_keys_end_by_revoking_and_expiry_and_are_kept_nowhere(
-    guarded: TestClient, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("app.access.FRESH_S", 0.0)  # each request looks
+def test_keys_end_by_revoking_and_expiry_and_are_kept_nowhere(guarded: TestClient, store: Store) -> None:
     made = store.accounts.create_key("anna", ["read"], lasts=timedelta(days=1))
     with store.database.reading() as session:
         row = session.scalars(select(tables.KeyRow)).one()
@@ -287,7 +285,6 @@ def test_loopback_asks_nobody_until_there_is_a_key(
 def test_a_stream_of_events_ends_with_the_key(
     guarded: TestClient, store: Store, steps: Steps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.access.FRESH_S", 0.0)
     monkeypatch.setattr("app.routes.jobs.LOOK_S", 0.1)
     steps.owner = "anna"
     photo = steps.receive()

@@ -46,14 +46,14 @@ def change(client: TestClient, photo: Any, **said: Any) -> Any:
     return client.patch(f"/v1/photos/{photo.public_id}", json=said)
 
 
-def after_first_read(patch: pytest.MonkeyPatch, change: Callable[[], object] = lambda: None) -> list[str]:
-    """Let a change happen when a watching request has read its job once; return the list of what it reads."""
+def after_two_reads(patch: pytest.MonkeyPatch, change: Callable[[], object] = lambda: None) -> list[str]:
+    """Let a change happen once a watching request has read its job twice; return what it reads."""
     find, reads = jobs.find_job, list[str]()
 
     def find_then_change(call: Call, job_id: str) -> JobOut:
         job = find(call, job_id)
         reads.append(job_id)
-        if len(reads) == 1:
+        if len(reads) == 2:
             change()
         return job
 
@@ -203,9 +203,7 @@ def test_a_waiting_request_answers_at_the_change(
     client: TestClient, steps: Steps, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo = steps.receive()
-    after_first_read(
-        monkeypatch, lambda: store.photos.set_state(photo.public_id, ("received",), "inspecting")
-    )
+    after_two_reads(monkeypatch, lambda: store.photos.set_state(photo.public_id, ("received",), "inspecting"))
     began = time.monotonic()
 
     job = get(client, f"jobs/{photo.public_id}?wait=10")
@@ -217,7 +215,7 @@ def test_a_waiting_request_answers_at_the_change(
 def test_a_finished_job_answers_at_once(
     client: TestClient, steps: Steps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    photo, reads = steps.counted(), after_first_read(monkeypatch)
+    photo, reads = steps.counted(), after_two_reads(monkeypatch)
     monkeypatch.setattr(jobs, "LOOK_S", 60.0)
 
     assert get(client, f"jobs/{photo.public_id}?wait=20")["state"] == "succeeded"
@@ -228,7 +226,7 @@ def test_events_send_each_state_once_until_the_end_which_who_comes_again_is_told
     client: TestClient, steps: Steps, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = f"/v1/jobs/{(photo := steps.receive()).public_id}"
-    after_first_read(monkeypatch, lambda: store.photos.cancel(photo.public_id, ANY_OWNER))
+    after_two_reads(monkeypatch, lambda: store.photos.cancel(photo.public_id, ANY_OWNER))
 
     told = [client.get(f"{path}/events").text for _ in range(2)]
 

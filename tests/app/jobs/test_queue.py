@@ -27,7 +27,7 @@ from obstore import exceptions as stored
 from sqlalchemy import exc
 from starlette.testclient import TestClient
 
-from app.jobs.queue import MAX_DEATHS, DbosEngine, Handler, durable, end_job, insist
+from app.jobs.queue import MAX_DEATHS, POLL_S, DbosEngine, Handler, durable, end_job, insist
 from app.jobs.worker import Worker
 from app.runtime.outage import is_outage
 from app.runtime.settings import Settings
@@ -103,6 +103,7 @@ def test_photos_run_side_by_side_one_more_than_there_are_slots(start: Start) -> 
         running.add(number)
         most.append(len(running))
         together.wait()
+        time.sleep(3.0 * POLL_S)  # so long that a fourth could begin
         running.remove(number)
 
     engine, jobs = start(photo=photo), [Job("photo", (n,)) for n in range(6)]

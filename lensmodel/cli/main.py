@@ -33,7 +33,6 @@ COMMANDS: Final[Mapping[str | None, Mapping[str, tuple[str, str]]]] = {
     },
     "Research": {
         "target": ("lensmodel.cli.measure", "Write the page to print for `lensmodel measure`."),
-        "psf": ("lensmodel.cli.report", "Show the image of a point of light at one place in the picture."),
         "export": ("lensmodel.cli.report", "Write PSFs for other programs."),
         "demo": ("lab.demo", "Run the whole process on a simulated lens whose true blur is known."),
         "reproduce": ("lab.commands", "Make the paper's figures and its Table 1 on simulated lenses."),

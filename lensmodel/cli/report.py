@@ -1,4 +1,4 @@
-"""`lensmodel report`, `psf` and `export`: what a profile says, and its PSFs for other programs."""
+"""`lensmodel report` and `export`: what a profile says, and its PSFs for other programs."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ from typing import Annotated, Final
 
 import typer
 
-from lensmodel import quality
 from lensmodel.cli import console, files
 from lensmodel.cli.console import Display, UsageError
 from lensmodel.core.files import to_json, write_atomically
 from lensmodel.core.names import camera_name, full_name
-from lensmodel.core.psf import rms_width
-from lensmodel.core.types import ZONE_WORDS, FieldPosition, LensSettings, zone_of
+from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.report import (
     LensReport,
     compare,
@@ -28,7 +26,6 @@ from lensmodel.report import (
     widest,
 )
 from lensmodel.report import export as write_psfs
-from lensmodel.report.lens_report import SensorGeometry
 
 Aperture = Annotated[float | None, console.aperture("f-number; default: the widest that a photo had.")]
 
@@ -178,51 +175,3 @@ def export(
         )
     write_psfs(output, psfs, file_format)
     shown.result(str(output))
-
-
-def psf(
-    profile: console.ProfileFile,
-    r: Annotated[float, console.RADIUS] = 0.0,
-    phi: Annotated[float, console.ANGLE] = 0.0,
-    aperture: Annotated[float | None, console.aperture("f-number; default: all together.")] = None,
-    channel: console.Channel = "g",
-    size: console.Size = 55,
-    json_output: console.Json = False,
-) -> None:
-    """Show the image of a point of light at one place in the picture.
-
-    Examples:
-
-        lensmodel psf my-24mm.lensprofile --r 0.9 --phi 0.6 --aperture 1.4
-
-        lensmodel psf my-24mm.lensprofile --json
-
-    `lensmodel export` writes it to a file.
-
-    Exit status: 0 answered, 1 the profile cannot be used, 2 wrong usage.
-    """
-    shown = Display(as_json=json_output)
-    with files.as_usage():
-        place = FieldPosition(r, phi)
-        settings = LensSettings(aperture=aperture, channel=channel)
-    with shown.progress("computing the PSF"):
-        answer = files.profile_at(profile).model.query(place, settings, size)
-    tangential, sagittal = quality.tangential_sagittal_mtf50(answer.kernel, place.phi)
-    words = SensorGeometry().words
-    shown.result(
-        f"{ZONE_WORDS[zone_of(place.r)]}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, "
-        f"MTF50 tangential {words(tangential)}, sagittal {words(sagittal)} cycles/px; "
-        f"photos: {answer.photos}, {answer.effective_samples:.1f} effective samples, expected error "
-        f"{answer.predicted_error:.2f}{' (beyond what the photos cover)' if answer.extrapolated else ''}; "
-        f"answered by {answer.answered_by}"
-    )
-    support = ("effective_samples", "photos", "extrapolated", "predicted_error", "nearest", "answered_by")
-    shown.document(
-        {
-            "query": {"r": place.r, "phi": place.phi, "aperture": aperture, "channel": channel, "size": size},
-            "support": {name: getattr(answer, name) for name in (*support, "weights")},
-            "rms_width_px": rms_width(answer.kernel),
-            "mtf50": {"tangential": tangential, "sagittal": sagittal},
-            "psf": {"shape": list(answer.kernel.shape), "dtype": "float32", "data": answer.kernel.tolist()},
-        }
-    )

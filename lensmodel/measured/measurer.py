@@ -396,9 +396,8 @@ def _error_of(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
 # once, no command repeats it)
 CHANGE: Final = 0.3
 CENTRED_PX: Final = 0.3  # expected distance of the centre of mass from the middle: that of the match (chosen)
-_STEPS_PX: Final = (0.25, 0.1, 0.04)  # of the search for the phase, coarse to fine (chosen)
 _MOST_PX: Final = 1.0  # largest phase along an axis: a whole pixel is another match (chosen)
-_MOST_MOVES: Final = 24  # with one step, at most: enough to cross the whole square of phases (chosen)
+_FIRST_PX, _LAST_PX = 0.25, 0.03  # steps of the search for the phase, coarse to fine (chosen)
 _SEARCHED: Final = 100  # steps from one phase to the next: only the order of their misfits counts (chosen)
 
 
@@ -406,40 +405,31 @@ def _on_its_grid(
     eq: _Equations, prior: NDArray[np.float64], start: NDArray[np.float64], size: int
 ) -> tuple[NDArray[np.float64], tuple[float, float]]:
     """Kernel and phase (row, col) in pixels at which k >= 0 explains the window best."""
-    light = float(start.sum())
+    light, k = float(start.sum()), start
     # moving a kernel by sinc lengthens none; the prior is the same for all
     largest = 1.02 * float(
         scipy.linalg.eigvalsh(eq.a + np.diag(prior), subset_by_index=(len(prior) - 1,) * 2)[0]
     )
-    known: dict[tuple[float, float], tuple[float, NDArray[np.float64]]] = {}
 
-    def cost(phase: tuple[float, float], near: NDArray[np.float64]) -> float:
-        if phase not in known:
-            a, b = _moved(eq, phase, size)
-            k = _of_sum(a + np.diag(prior), b, near, light, largest, _SEARCHED)
-            off = centroid(as_kernel(k.reshape(size, size)))
-            misfit = float(k @ a @ k) - 2.0 * float(b @ k) + float(prior @ (k * k))
-            known[phase] = misfit + (off[0] ** 2 + off[1] ** 2) / CENTRED_PX**2, k
-        return known[phase][0]
+    def cost(phase: NDArray[np.float64]) -> float:
+        nonlocal k
+        a, b = _moved(eq, phase, size)
+        k = _of_sum(a + np.diag(prior), b, k, light, largest, _SEARCHED)
+        off = centroid(as_kernel(k.reshape(size, size)))
+        misfit = float(k @ a @ k) - 2.0 * float(b @ k) + float(prior @ (k * k))
+        return misfit + (off[0] ** 2 + off[1] ** 2) / CENTRED_PX**2
 
-    best = (0.0, 0.0)
-    cost(best, start)
-    for step in _STEPS_PX:
-        for _ in range(_MOST_MOVES):
-            around = [
-                (round(best[0] + i * step, 3), round(best[1] + j * step, 3))
-                for i, j in ((-1, 0), (1, 0), (0, -1), (0, 1))
-            ]
-            inside = [phase for phase in around if max(map(abs, phase)) <= _MOST_PX]
-            better = min(inside, key=lambda phase: cost(phase, known[best][1]))
-            if known[better][0] >= known[best][0]:
-                break
-            best = better
-    return known[best][1], best
+    steps = {"initial_simplex": [(0.0, 0.0), (_FIRST_PX, 0.0), (0.0, _FIRST_PX)], "xatol": _LAST_PX}
+    best = scipy.optimize.minimize(
+        cost, (0.0, 0.0), method="Nelder-Mead", bounds=[(-_MOST_PX, _MOST_PX)] * 2,
+        options={**steps, "fatol": np.inf},
+    )  # fmt: skip
+    cost(best.x)
+    return k, (float(best.x[0]), float(best.x[1]))
 
 
 def _moved(
-    eq: _Equations, phase: tuple[float, float], size: int
+    eq: _Equations, phase: NDArray[np.float64], size: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """S'AS and S'b, axis by axis."""
     n, t = size * size, np.arange(size)

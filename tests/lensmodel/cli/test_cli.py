@@ -29,7 +29,6 @@ from deadline import Deadline, stretched
 from PIL import ExifTags, Image
 from running import SMALL, lens_of_one_blur, scene, write_photo
 from scipy import ndimage
-from typer.testing import CliRunner
 
 from lab.kernels import gaussian
 from lensmodel import photo
@@ -37,7 +36,6 @@ from lensmodel.blind import sampling
 from lensmodel.cli import files
 from lensmodel.cli.console import EVERY_S, Bar
 from lensmodel.cli.correct import targets_of
-from lensmodel.cli.main import app
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import load_profile, save_profile
@@ -277,15 +275,6 @@ def test_folders_pass_over_what_was_made_of_a_raw_file_and_bad_photos_do_not_sto
     assert [path.name for path in (folder / "out").iterdir()] == ["one-corrected.tif"]
 
 
-def test_psf_says_what_made_the_answer(folder: Path) -> None:
-    words = ["psf", str(folder / PROFILE), "--size", "15"]
-    said, document = (CliRunner().invoke(app, [*words, *more]).output for more in ([], ["--json"]))
-
-    support = json.loads(document)["support"]
-    assert (support["answered_by"], support["weights"]) == ("regression", "")
-    assert "answered by regression" in " ".join(said.split())
-
-
 def test_two_runs_on_one_profile_drop_nothing_of_each_other(
     folder: Path, made: Path, here: Here, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -352,8 +341,8 @@ REFUSED = {
     "unknown estimator": ((*CALIBRATE, "-p", "new", "--estimator", "x"), 2, "known: .*michaeli-irani"),
     "unknown selector": ((*CALIBRATE, "-p", "new", "--selector", "best"), 2, "known: .*good-regions"),
     "aperture": ((*CALIBRATE, "-p", "new", "--aperture", "-2"), 2, "-2"),
-    "aperture in words": (("psf", PROFILE, "--aperture", "wide"), 2, "such as 2.8 or f/2.8, got 'wide'"),
-    "even size": (("psf", PROFILE, "--size", "20"), 2, "must be odd, got 20"),
+    "aperture in words": (("report", PROFILE, "--aperture", "wide"), 2, "such as 2.8 or f/2.8, got 'wide'"),
+    "even size": (("export", PROFILE, "-o", "new.npz", "--size", "20"), 2, "must be odd, got 20"),
     "noise in words": (("bench", "blind", "--noise", "much"), 2, "such as 0.01,0.003, got 'much'"),
     "photo to time": (("bench", "correct", "--photo", "gone.jpg"), 2, "no photo called gone.jpg"),
     "photos to blur": (("bench", "blind", "--photos", "empty", "-o", "o"), 2, "empty holds no PNG, JPEG"),
@@ -645,10 +634,10 @@ def test_a_benchmark_of_the_lens_model_says_how_far_it_is(on_a_terminal: Seen) -
 
 
 def test_a_question_to_the_lens_says_that_it_is_being_answered(on_a_terminal: Seen) -> None:
-    said, seen = on_a_terminal("psf", PROFILE)
+    said, seen = on_a_terminal("export", PROFILE, "-o", "new.npz", "--size", "15")
 
-    assert said.startswith("centre, r 0")
-    assert "computing the PSF" in seen
+    assert said.splitlines() == ["new.npz"]
+    assert "computing its PSFs" in seen
 
 
 def _read(terminal: int) -> bytes:

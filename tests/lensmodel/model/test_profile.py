@@ -169,18 +169,6 @@ def changed(folder: Path, change: dict[str, object]) -> Path:
     return path
 
 
-def test_earlier_profiles_open_without_the_photos_that_they_leave_out(tmp_path: Path) -> None:
-    before = profile().model
-    kept = [sample for sample in before.samples if sample.photo != "p1"]
-    after = load_profile(changed(tmp_path, {"model": {"phi": 0.4, "excluded": ["p1"]}})).model
-
-    assert len(after.samples) == len(kept) < len(before.samples)
-    where, wanted = FieldPosition(0.5, 2.0), LensModel.fit(kept, before.settings)
-    assert (
-        np.abs(after.query(where, GREEN, SIZE).kernel - wanted.query(where, GREEN, SIZE).kernel).max() < 1e-6
-    )
-
-
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nonsense", b"\x80\x04pickle"])
 def test_other_bytes_are_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.lensprofile").write_bytes(content)
@@ -195,7 +183,6 @@ def test_other_bytes_are_refused(content: bytes, tmp_path: Path) -> None:
         ({"format": 1, "samples": []}, "calibrate again"),
         ({"model": {"mode": "magic"}}, "no mode"),
         ({"model": {"unknown": 1}}, "damaged"),
-        ({"model": {"excluded": ["p0", "p1", "p2"]}}, "no PSF samples"),
         ({"samples": []}, "one is needed"),
         ({"lens": 7}, "damaged"),
         ({"samples": [{"r": "far"}] * 48}, "damaged"),

@@ -340,7 +340,6 @@ BLOCK: Final = 4  # pixels of a coarse plane's block: coarser than detail, finer
 _JOINT: Final = 4
 """Pixels over which the ends of a tile fade into each other where its rim is cut off (chosen: with none, the
 step between the ends rings inwards; more is computed for nothing)."""
-Seam = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -382,15 +381,18 @@ class Canvas:
         The rest of the margin fades from one end to the other.
         """
         y = np.empty((len(planes), *self.shape), dtype=np.float32)
-        rows, cols = (
-            _seam(extent, length) for extent, length in zip(planes.shape[1:], self.shape, strict=True)
-        )
-        _fill(planes, ONE / light, self.margin - beyond, rows, cols, y)
-        return y
+        high, wide = planes.shape[1:]
+        np.divide(planes, light[:, None, None], out=y[:, :high, :wide])
+        first, second, fade = _seam(high, self.shape[0])
+        t = fade[:, None]
+        y[:, high:, :wide] = y[:, first, :wide] * (ONE - t) + y[:, second, :wide] * t
+        first, second, fade = _seam(wide, self.shape[1])
+        y[:, :, wide:] = y[:, :, first] * (ONE - fade) + y[:, :, second] * fade
+        return np.roll(y, (self.margin - beyond,) * 2, axis=(1, 2))
 
 
 @lru_cache(maxsize=64)
-def _seam(rows: int, length: int) -> Seam:
+def _seam(rows: int, length: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Real]:
     """Rows to fade from and to beyond `rows`, up to `length`, and the share of the latter."""
     t = np.arange(length - rows)
     fade = ((t + 0.5) / max(length - rows, 1)).astype(np.float32)
@@ -407,27 +409,10 @@ def fitted_halo(cell: tuple[int, int], least: int) -> int:
     return least + min(np.subtract(fast_shape(needed), needed)) // 2
 
 
-@jit
-def _fill(planes: Real, gains: Real, margin: int, rows: Seam, cols: Seam, y: Real) -> None:
-    """Place planes times `gains` on a canvas; the margin fades from one end to the other."""
-    channels, high, wide = planes.shape
-    height, width = y.shape[1], y.shape[2]
-    line = np.empty(wide, np.float32)
-    for c in range(channels):
-        for i in range(height):
-            if i < high:
-                for j in range(wide):
-                    line[j] = planes[c, i, j] * gains[c]
-            else:
-                a, b, t = rows[0][i - high], rows[1][i - high], rows[2][i - high]
-                for j in range(wide):
-                    line[j] = (planes[c, a, j] * (ONE - t) + planes[c, b, j] * t) * gains[c]
-            row = (i + margin) % height
-            y[c, row, margin : margin + wide] = line
-            for j in range(wide, width):
-                t = cols[2][j - wide]
-                value = line[cols[0][j - wide]] * (ONE - t) + line[cols[1][j - wide]] * t
-                y[c, row, (j + margin) % width] = value
+def block_sums(plane: Real, side: int) -> Real:
+    """Sums over square blocks of a plane's pixels; the last ones may be smaller."""
+    rows, cols = (np.arange(0, extent, side) for extent in plane.shape)
+    return np.asarray(np.add.reduceat(np.add.reduceat(plane, rows, axis=0), cols, axis=1))
 
 
 def spread_blocks(blocks: NDArray[np.float32], canvas: Canvas) -> NDArray[np.float32]:

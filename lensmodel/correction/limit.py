@@ -33,8 +33,6 @@ _LEVEL: Final = 0.1
 _LINE_SHARE, _EDGE_SHARE = 0.12, 0.25
 """Share of a window that lies at the level of a line, and of an edge (chosen: a line narrower than its blur
 is as bright as its middle over a tenth of a window, an edge over a quarter at least)."""
-_HUE_REACH: Final = 2
-"""Radius of the window whose colours a pixel may have (chosen: with 3, more blocks of foliage lose)."""
 _PURER: Final = 0.01
 """By how much a colour's share of the light may leave the range nearby where the kernel is unsure (chosen:
 colours that blur has washed out get purer; with twice as much, a block more of foliage loses half a decibel,
@@ -62,10 +60,9 @@ _EDGE, _UNSURE = 0.06, 0.1
 which more is allowed (chosen: half of what shows as a halo; the other half is left to grain)."""
 _EXACT: Final = 0.02
 """Least error of a kernel that is reckoned with: none is known better over a whole tile (chosen)."""
-_FREE: Final = 1e6  # stands for no bound where infinity would make differences undefined
+_FREE: Final = 1e6  # stands for no bound where infinity would make sums undefined
 _DARKEST: Final = 0.5
 """Share of the darkest light nearby that remains where the kernel is unsure (chosen: one stop)."""
-_AXES: Final = 3  # differences of two colours' shares of the light: six half planes of a hull
 _SIGMAS: Final = 3.0
 """Standard deviations of the noise in the dark that are added as grey as well (chosen: below, noise decides
 which colour is the largest)."""
@@ -146,8 +143,8 @@ def limited(
     dark = math.hypot(*(sensor.noise.sigma_at(0.0) for sensor in sensors))
     held = np.array(restored, dtype=np.float32, order="C")
     photo = np.ascontiguousarray(photo, dtype=np.float32)
-    wide, shape = min(reach, _MOST) + _PLATEAU, photo.shape[1:]
-    near, number = np.zeros(shape, dtype=np.bool_), np.empty((0, 0), dtype=np.float32)
+    wide = min(reach, _MOST) + _PLATEAU
+    near, number = np.zeros(photo.shape[1:], dtype=np.bool_), np.empty((0, 0), dtype=np.float32)
     clip = np.array([min(sensor.clip, _FREE) for sensor in sensors], dtype=np.float32)
     clipped = photo >= clip[:, None, None]
     solved = (held > np.float32(_LAMP) * clip[:, None, None]).any(axis=0)
@@ -155,26 +152,26 @@ def limited(
         broad = np.stack([plane & ~compact(plane, reach) for plane in clipped])
         white = broad.sum(axis=0) > 1
         number = clipped.sum(axis=0, dtype=np.float32)
-        kinds = np.maximum(np.minimum(number, 1.0), np.float32(2.0) * ((number > 1.0) | solved))
-        glow = wide + max(blur.reach for blur in blurs)  # and what a cut kernel leaves
         inside = (photo >= np.float32(LEAST_CLIPPED) * clip[:, None, None]).all(axis=0)
         inside = ndimage.binary_erosion(inside, np.ones((3, 3)), border_value=1)
         held[:, inside] = np.maximum(held[:, inside], photo[:, inside])
-        _beside_lamps(photo, held, broad | white, kinds, white.astype(np.float32), glow, near)
+        glow = wide + max(blur.reach for blur in blurs)  # and what a cut kernel leaves
+        near = ndimage.maximum_filter((number > 0) | solved, 2 * glow + 1)
+        lamp = ndimage.maximum_filter((number > 1) | solved, 2 * glow + 1)
+        glare = ndimage.maximum_filter(white, 2 * (glow // 2) + 1)
+        _beside_lamps(photo, held, broad | white, near, lamp, glare)
     darkest = np.float32(_DARKEST * min(error / _SURE, 1.0) if halo is None else 0.0)
-    most = np.empty(shape, dtype=np.float32)
-    _hold_light(photo, held, near, wide, (np.float32(room), np.float32(edge)), darkest, most)
+    most = _hold_light(photo, held, near, wide, np.float32(room), np.float32(edge), darkest)
     _hold_colour(photo, held, most, number, clip, np.float32(_SIGMAS * dark + 1e-6), np.float32(known))
     if halo is None:
         own = np.where(near, np.float32(1.0), np.float32(known))
         for plane, made, sensor in zip(photo, held, sensors, strict=True):
             _hold_own(plane, made, own, np.float32(_SIGMAS * sensor.noise.sigma_at(0.0)))
     elif halo < _FREE:
-        low, high = np.empty_like(photo), np.empty_like(photo)
-        for c in range(len(photo)):
-            extremes(photo[c], photo[c], _REACH, low[c], high[c])
-        more = np.float32(halo) * (high - low)
-        np.clip(held, low - more, high + more, out=held)
+        for plane, made in zip(photo, held, strict=True):
+            low, high = extremes(plane, plane, _REACH)
+            more = np.float32(halo) * (high - low)
+            np.clip(made, low - more, high + more, out=made)
     return held
 
 
@@ -184,9 +181,10 @@ def widening(error: float) -> tuple[float, float]:
 
 
 @jit
-def extremes(below: Real, above: Real, reach: int, low: Real, high: Real) -> None:
-    """Least light of one plane and largest of another in the square around each pixel; rims repeat."""
+def extremes(below: Real, above: Real, reach: int) -> tuple[Real, Real]:
+    """Least value of one plane and largest of another in the square around each pixel; rims repeat."""
     rows, cols = below.shape
+    low, high = np.empty_like(below), np.empty_like(above)
     least, most = np.empty(cols + 2 * reach, np.float32), np.empty(cols + 2 * reach, np.float32)
     for i in range(rows):
         line, top = low[i], high[i]
@@ -198,297 +196,188 @@ def extremes(below: Real, above: Real, reach: int, low: Real, high: Real) -> Non
                 top[j] = max(top[j], above[k, j])
         least[reach : reach + cols] = line
         most[reach : reach + cols] = top
-        for j in range(reach):
-            least[j], most[j] = line[0], top[0]
-            least[reach + cols + j], most[reach + cols + j] = line[cols - 1], top[cols - 1]
+        least[:reach], least[reach + cols :] = line[0], line[cols - 1]
+        most[:reach], most[reach + cols :] = top[0], top[cols - 1]
         for k in range(2 * reach + 1):
             for j in range(cols):
                 line[j] = min(line[j], least[j + k])
                 top[j] = max(top[j], most[j + k])
+    return low, high
 
 
 @jit
-def _mean3(plane: Real, out: Real) -> None:
-    """Mean over 3 x 3 pixels; rims repeat."""
-    rows, cols = plane.shape
-    line, ninth = np.empty(cols, np.float32), np.float32(1.0 / 9.0)
-    for i in range(rows):
-        above, below = max(i - 1, 0), min(i + 1, rows - 1)
-        for j in range(cols):
-            line[j] = (plane[above, j] + plane[i, j] + plane[below, j]) * ninth
-        for j in range(1, cols - 1):
-            out[i, j] = line[j - 1] + line[j] + line[j + 1]
-        out[i, 0] = line[0] + line[0] + line[min(1, cols - 1)]
-        out[i, cols - 1] = line[max(cols - 2, 0)] + line[cols - 1] + line[cols - 1]
-
-
-@jit
-def _levels(light: Real, reach: int) -> Real:
+def _levels(light: Real, reach: int) -> tuple[Real, Real, Real, Real]:
     """Levels around every second pixel of every second row, as seen, and how much of an edge each makes.
 
     The first two are the least and most light within `reach` pixels; the others are 1 where a quarter of that
     window lies at this level, 0 where it is a line.
     """
-    rows, cols = (light.shape[0] + 1) // 2, (light.shape[1] + 1) // 2
     wide = (reach + 1) // 2
-    levels = np.empty((4, rows, cols), np.float32)
-    bottom, top, below, above = levels[0], levels[1], levels[2], levels[3]
-    level, seen = np.empty_like(light), np.empty((rows, cols), np.float32)
-    _mean3(light, level)
+    rows, cols = (light.shape[0] + 1) // 2, (light.shape[1] + 1) // 2
+    seen = np.empty((rows, cols), np.float32)
     for i in range(rows):
         for j in range(cols):
-            seen[i, j] = np.sqrt(max(level[2 * i, 2 * j], ZERO))
-    extremes(seen, seen, wide, bottom, top)
+            total = ZERO
+            for k in range(2 * i - 1, 2 * i + 2):
+                line = light[min(max(k, 0), light.shape[0] - 1)]
+                total += line[max(2 * j - 1, 0)] + line[2 * j] + line[min(2 * j + 1, light.shape[1] - 1)]
+            seen[i, j] = np.sqrt(max(total, ZERO) / np.float32(9.0))
+    bottom, top = extremes(seen, seen, wide)
+    room = np.float32(_LEVEL) * (top - bottom)
+    low, high = bottom + room, top - room
+    below, above = np.empty_like(seen), np.empty_like(seen)
     padded = np.empty((rows + 2 * wide, cols + 2 * wide), np.float32)
     for i in range(rows + 2 * wide):
         line = seen[min(max(i - wide, 0), rows - 1)]
         padded[i, wide : wide + cols] = line
-        padded[i, :wide] = line[0]
-        padded[i, wide + cols :] = line[cols - 1]
-    low, high = np.empty(cols, np.float32), np.empty(cols, np.float32)
+        padded[i, :wide], padded[i, wide + cols :] = line[0], line[cols - 1]
+    side = 2 * wide + 1
+    start, full = np.float32(_LINE_SHARE * side**2), np.float32((_EDGE_SHARE - _LINE_SHARE) * side**2)
     dark, bright = np.empty(cols, np.int32), np.empty(cols, np.int32)
-    all_of_it = np.float32((2 * wide + 1) ** 2)
     for i in range(rows):
-        for j in range(cols):
-            room = np.float32(_LEVEL) * (top[i, j] - bottom[i, j])
-            low[j], high[j] = bottom[i, j] + room, top[i, j] - room
         dark[:] = 0
         bright[:] = 0
-        for k in range(2 * wide + 1):
-            for l in range(2 * wide + 1):
+        for k in range(side):
+            for l in range(side):
                 for j in range(cols):
-                    value = padded[i + k, j + l]
-                    dark[j] += np.int32(value <= low[j])
-                    bright[j] += np.int32(value >= high[j])
-        start = np.float32(_LINE_SHARE) * all_of_it
-        scale = np.float32(1.0 / (_EDGE_SHARE - _LINE_SHARE)) / all_of_it
+                    dark[j] += np.int32(padded[i + k, j + l] <= low[i, j])
+                    bright[j] += np.int32(padded[i + k, j + l] >= high[i, j])
         for j in range(cols):
-            below[i, j] = min(max((np.float32(dark[j]) - start) * scale, ZERO), ONE)
-            above[i, j] = min(max((np.float32(bright[j]) - start) * scale, ZERO), ONE)
-    return levels
+            below[i, j] = min(max((np.float32(dark[j]) - start) / full, ZERO), ONE)
+            above[i, j] = min(max((np.float32(bright[j]) - start) / full, ZERO), ONE)
+    return bottom, top, below, above
 
 
 @jit
-def _hold_light(
-    y: Real, x: Real, free: Mask, wide: int, shares: tuple[Number, Number], darkest: Number, most: Real
-) -> None:
+def _hold_light(y: Real, x: Real, free: Mask, wide: int, room: Number, edge: Number, darkest: Number) -> Real:
     """Hold the light of `x` within that of `y` nearby, widened, in place, but where it is `free`.
 
-    `most` receives the brightest light within 2 pixels, as seen.
+    Return the brightest light within 2 pixels, as seen.
     """
-    rows, cols = most.shape
     third, tiny = np.float32(1.0 / 3.0), np.float32(_TINY)
-    room, edge = shares
-    floor = np.sqrt(darkest)
-    light, seen = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    for i in range(rows):
-        for j in range(cols):
-            light[i, j] = third * (y[0, i, j] + y[1, i, j] + y[2, i, j])
-            seen[i, j] = np.sqrt(max(light[i, j], ZERO))
-    least = np.empty((rows, cols), np.float32)
-    extremes(seen, seen, _REACH, least, most)
-    levels, near = _levels(light, wide), np.empty((4, cols), np.float32)
-    bottom, top, below, above = near[0], near[1], near[2], near[3]
-    for i in range(rows):
-        for k in range(4):
-            for j in range(cols):
-                near[k, j] = levels[k, i // 2, j // 2]
-        for j in range(cols):
-            low, high = least[i, j], most[i, j]
+    light = third * (y[0] + y[1] + y[2])
+    seen = np.sqrt(np.maximum(light, ZERO))
+    least, most = extremes(seen, seen, _REACH)
+    bottom, top, below, above = _levels(light, wide)
+    for i in range(light.shape[0]):
+        for j in range(light.shape[1]):
+            a, b = i // 2, j // 2
+            line = room * (most[i, j] - least[i, j])
+            less = line - min(edge * (top[a, b] - bottom[a, b]), line)
             now = np.sqrt(third * (max(x[0, i, j], ZERO) + max(x[1, i, j], ZERO) + max(x[2, i, j], ZERO)))
-            line, at_edge = room * (high - low), edge * (top[j] - bottom[j])
-            up = line + above[j] * (min(at_edge, line) - line)
-            down = line + below[j] * (min(at_edge, line) - line)
-            bound = min(max(now, low - down, floor * low), high + up)
-            share = bound / max(now, tiny)
-            share = ONE if free[i, j] else share * share
-            lost = now < tiny and share > ZERO and not free[i, j]
-            fill = bound * bound / max(light[i, j], np.float32(1e-9))
-            x[0, i, j] = y[0, i, j] * fill if lost else x[0, i, j] * share
-            x[1, i, j] = y[1, i, j] * fill if lost else x[1, i, j] * share
-            x[2, i, j] = y[2, i, j] * fill if lost else x[2, i, j] * share
+            low = max(least[i, j] - line + below[a, b] * less, np.sqrt(darkest) * least[i, j])
+            bound = min(max(now, low), most[i, j] + line - above[a, b] * less)
+            share = (bound / max(now, tiny)) ** 2
+            if free[i, j]:
+                continue
+            for c in range(3):
+                if now < tiny and share > ZERO:
+                    x[c, i, j] = y[c, i, j] * bound * bound / max(light[i, j], np.float32(1e-9))
+                else:
+                    x[c, i, j] *= share
+    return most
 
 
 @jit
 def _hold_own(y: Real, x: Real, room: Real, dark: Number) -> None:
     """Hold one colour within its own range within 2 pixels, widened, in place."""
-    rows, cols = y.shape
-    seen = np.empty((rows, cols), np.float32)
-    low, high = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    for i in range(rows):
-        for j in range(cols):
-            seen[i, j] = np.sqrt(max(y[i, j], ZERO) + dark)
-    extremes(seen, seen, _REACH, low, high)
-    for i in range(rows):
-        for j in range(cols):
+    seen = np.sqrt(np.maximum(y, ZERO) + dark)
+    low, high = extremes(seen, seen, _REACH)
+    for i in range(y.shape[0]):
+        for j in range(y.shape[1]):
             more = room[i, j] * (high[i, j] - low[i, j])
             least, most = max(low[i, j] - more, ZERO), high[i, j] + more
             x[i, j] = min(max(x[i, j], least * least - dark), most * most - dark)
 
 
-@jit
-def _beside_lamps(y: Real, x: Real, fixed: Mask, kinds: Real, white: Real, glow: int, near: Mask) -> None:
-    """Hold each colour around clipped light and lamps within that of the photo, in place; mark where that is.
+def _beside_lamps(y: Planes, x: Planes, fixed: Mask, near: Mask, lamp: Mask, glare: Mask) -> None:
+    """Hold each colour near clipped light and lamps within that of the photo, in place.
 
     Specks in a dark glow are seen before all else, and darker twigs are not: so the most is that within 1
-    pixel, the least that within 2 or 3. `kinds` is 2 for lamps and for what clips in more than one colour,
-    and 1 for other clipped light.
+    pixel, the least that within 3, and within 2 where a `lamp` or what clips in more than one colour is near.
     """
-    rows, cols = kinds.shape
-    unused, darker = np.empty_like(kinds), np.empty_like(kinds)
-    kind, glare = np.empty_like(kinds), np.empty_like(kinds)
-    least, dimmest, brightest = np.empty_like(kinds), np.empty_like(kinds), np.empty_like(kinds)
-    extremes(kinds, kinds, glow, unused, kind)
-    extremes(white, white, glow // 2, unused, glare)
-    for c in range(3):
-        extremes(y[c], y[c], 1, darker, brightest)
-        extremes(darker, y[c], 1, dimmest, unused)  # within 2
-        extremes(dimmest, y[c], 1, least, unused)  # within 3
-        for i in range(rows):
-            for j in range(cols):
-                near[i, j] = kind[i, j] > ZERO
-                low = dimmest[i, j] if kind[i, j] > ONE else least[i, j]
-                high = y[c, i, j] if glare[i, j] > ZERO else brightest[i, j]
-                if fixed[c, i, j]:
-                    x[c, i, j] = y[c, i, j]
-                elif near[i, j]:
-                    x[c, i, j] = min(max(x[c, i, j], low), high)
+    for before, after, fix in zip(y, x, fixed, strict=True):
+        low = np.where(lamp, *(extremes(before, before, reach)[0] for reach in (2, 3)))
+        high = np.where(glare, before, extremes(before, before, 1)[1])
+        np.copyto(after, np.clip(after, low, high), where=near)
+        np.copyto(after, before, where=fix)
 
 
 @jit
-def _axes(planes: Real, floor: Real, i: int, shares: Real, axes: Real) -> None:
-    """Each colour's share of a row's light, and its coordinates, whose ranges are half planes of a hull."""
+def _shares(planes: Real, floor: Real) -> tuple[Real, Real]:
+    """Each colour's share of the light, and their differences, whose ranges are half planes of a hull."""
     third = np.float32(1.0 / 3.0)
-    for j in range(floor.size):
-        r, g, b = max(planes[0, i, j], ZERO), max(planes[1, i, j], ZERO), max(planes[2, i, j], ZERO)
-        grey = third * floor[j]
-        total = ONE / (r + g + b + floor[j])
-        r, g, b = (r + grey) * total, (g + grey) * total, (b + grey) * total
-        shares[0, j], shares[1, j], shares[2, j] = r, g, b
-        axes[0, j], axes[1, j], axes[2, j] = r - g, g - b, b - r
+    shares, axes = np.empty_like(planes), np.empty_like(planes)
+    for i in range(floor.shape[0]):
+        for j in range(floor.shape[1]):
+            r, g, b = max(planes[0, i, j], ZERO), max(planes[1, i, j], ZERO), max(planes[2, i, j], ZERO)
+            grey = third * floor[i, j]
+            scale = ONE / (r + g + b + floor[i, j])
+            r, g, b = (r + grey) * scale, (g + grey) * scale, (b + grey) * scale
+            shares[0, i, j], shares[1, i, j], shares[2, i, j] = r, g, b
+            axes[0, i, j], axes[1, i, j], axes[2, i, j] = r - g, g - b, b - r
+    return shares, axes
 
 
 @jit
-def _hold_colour(  # noqa: C901, PLR0912 - one pass over the tile, row by row
-    y: Real, x: Real, most: Real, number: Real, clip: Real, dark: Number, known: Number
-) -> None:
+def _hold_colour(y: Real, x: Real, most: Real, number: Real, clip: Real, dark: Number, known: Number) -> None:
     """Draw the colours of `x` into the range of those of `y` nearby, in place.
 
-    `most` is the brightest light within 2 pixels, as seen.
+    `most` is the brightest light within 2 pixels, as seen, and `number` how many colours clip: of two the hue
+    is not known. It is empty where none does.
     """
-    rows, cols = most.shape
     purer = np.float32(_PURER) * known
-    grey_share = min(np.float32(_OWN_COLOURLESS / _COLOURLESS) * known, ONE)
-    lost = number.size > 0  # whether anything clips: of two clipped colours the hue is not known
-    reach, side = _HUE_REACH, 2 * _HUE_REACH + 1
-    least, floors = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    extremes(most, most, reach - _REACH, least, floors)
-    own, made = np.empty((3, cols), np.float32), np.empty((3, cols), np.float32)
-    here, there = np.empty((_AXES, cols), np.float32), np.empty((_AXES, cols), np.float32)
-    # ranges along rows, of the rows that the next one needs: all rows at once do not fit into a cache
-    lows, highs = np.empty((side, _AXES, cols), np.float32), np.empty((side, _AXES, cols), np.float32)
-    low, high = np.empty((_AXES, cols), np.float32), np.empty((_AXES, cols), np.float32)
-    padded = np.empty((2, cols + 2 * reach), np.float32)
-    share, kept = np.empty(cols, np.float32), np.zeros(cols, np.bool_)
-    for ahead in range(rows + reach):
-        if ahead < rows:
-            for j in range(cols):
-                floors[ahead, j] = max(
-                    dark, np.float32(3.0 * _COLOURLESS) * floors[ahead, j] * floors[ahead, j]
-                )
-            _axes(y, floors[ahead], ahead, own, here)
-            for k in range(_AXES):
-                _along(here[k], number, ahead, padded, lows[ahead % side, k], highs[ahead % side, k])
-        i = ahead - reach
-        if i < 0:
-            continue
-        low[:] = lows[i % side]
-        high[:] = highs[i % side]
-        for row in range(max(i - reach, 0), min(i + reach + 1, rows)):
-            for k in range(_AXES):
-                for j in range(cols):
-                    low[k, j] = min(low[k, j], lows[row % side, k, j])
-                    high[k, j] = max(high[k, j], highs[row % side, k, j])
-        for j in range(cols):
-            floors[i, j] = max(dark, grey_share * floors[i, j])
-        _axes(x, floors[i], i, made, there)
-        _axes(y, floors[i], i, own, here)
-        if lost:
-            _of_white(y, x, number, clip, i, low, high, own, here, kept)
-        share[:] = ONE
-        for k in range(_AXES):
-            for j in range(cols):
-                step = there[k, j] - here[k, j]
-                room = high[k, j] - here[k, j] if step > ZERO else here[k, j] - low[k, j]
-                share[j] = min(share[j], (max(room, ZERO) + purer) / max(abs(step), np.float32(1e-6)))
-        for j in range(cols):
-            t = ONE if kept[j] else max(share[j], ZERO)
-            floor, grey = floors[i, j], floors[i, j] * np.float32(1.0 / 3.0)
-            total = max(x[0, i, j], ZERO) + max(x[1, i, j], ZERO) + max(x[2, i, j], ZERO) + floor
-            r = (own[0, j] + t * (made[0, j] - own[0, j])) * total - grey
-            g = (own[1, j] + t * (made[1, j] - own[1, j])) * total - grey
-            b = (own[2, j] + t * (made[2, j] - own[2, j])) * total - grey
-            x[0, i, j] = r if t < ONE else x[0, i, j]
-            x[1, i, j] = g if t < ONE else x[1, i, j]
-            x[2, i, j] = b if t < ONE else x[2, i, j]
-
-
-@jit
-def _along(line: Real, number: Real, i: int, padded: Real, low: Real, high: Real) -> None:
-    """Range of a coordinate along a row; pixels of two clipped colours do not count."""
-    reach, cols = _HUE_REACH, line.size
-    padded[0, reach : reach + cols] = line
-    padded[1, reach : reach + cols] = line
-    if number.size > 0:
-        for j in range(cols):
-            if number[i, j] > ONE:
-                padded[0, reach + j], padded[1, reach + j] = np.float32(np.inf), np.float32(-np.inf)
-    for j in range(reach):
-        for k in range(2):
-            padded[k, j], padded[k, reach + cols + j] = padded[k, reach], padded[k, reach + cols - 1]
-    low[:] = padded[0, :cols]
-    high[:] = padded[1, :cols]
-    for k in range(1, 2 * reach + 1):
-        for j in range(cols):
-            low[j] = min(low[j], padded[0, j + k])
-            high[j] = max(high[j], padded[1, j + k])
-
-
-@jit
-def _of_white(
-    y: Real,
-    x: Real,
-    number: Real,
-    clip: Real,
-    i: int,
-    low: Real,
-    high: Real,
-    own: Real,
-    axes: Real,
-    kept: Mask,
-) -> None:
-    """Give pixels of a row that lost their hue to clipping that of their surroundings to be drawn to."""
-    for j in range(number.shape[1]):
-        kept[j] = False
-        if number[i, j] <= ONE:
-            continue
-        kept[j] = True
-        for c in range(3):
-            if y[c, i, j] >= clip[c] and x[c, i, j] < clip[c]:
-                kept[j] = False
-        if kept[j]:
-            continue
-        if low[0, j] > high[0, j]:  # white all around
-            kept[j] = True
+    floor = np.maximum(dark, np.float32(3.0 * _COLOURLESS) * most * most)
+    axes = _shares(y, floor)[1]
+    low, high = np.empty_like(axes), np.empty_like(axes)
+    for k in range(3):
+        below, above = axes[k], axes[k]
+        if number.size > 0:
+            below = np.where(number > ONE, np.float32(_FREE), axes[k])
+            above = np.where(number > ONE, np.float32(-_FREE), axes[k])
+        low[k], high[k] = extremes(below, above, _REACH)
+    floor = np.maximum(dark, min(np.float32(_OWN_COLOURLESS / _COLOURLESS) * known, ONE) * floor)
+    own, here = _shares(y, floor)
+    made, there = _shares(x, floor)
+    t, kept = np.empty(most.shape[1], np.float32), np.zeros(most.shape[1], np.bool_)
+    for i in range(most.shape[0]):
+        for j in range(t.size if number.size > 0 else 0):
+            kept[j] = number[i, j] > ONE and _keeps_colour(y, x, clip, i, j, low, high, own, here)
+        t[:] = ONE
+        for k in range(3):
+            for j in range(t.size):
+                step = there[k, i, j] - here[k, i, j]
+                room = high[k, i, j] - here[k, i, j] if step > ZERO else here[k, i, j] - low[k, i, j]
+                t[j] = min(t[j], (max(room, ZERO) + purer) / max(abs(step), np.float32(1e-6)))
+        for j in range(t.size):
+            total = max(x[0, i, j], ZERO) + max(x[1, i, j], ZERO) + max(x[2, i, j], ZERO) + floor[i, j]
+            grey = np.float32(1.0 / 3.0) * floor[i, j]
             for c in range(3):
-                x[c, i, j] = max(x[c, i, j], y[c, i, j])
-            continue
-        for k in range(_AXES):
-            axes[k, j] = np.float32(0.5) * (low[k, j] + high[k, j])
-        red, green = axes[0, j], axes[1, j]  # over green, and over blue
-        own[0, j] = np.float32(1.0 / 3.0) * (ONE + np.float32(2.0) * red + green)
-        own[1, j] = own[0, j] - red
-        own[2, j] = own[1, j] - green
+                drawn = (own[c, i, j] + t[j] * (made[c, i, j] - own[c, i, j])) * total - grey
+                x[c, i, j] = drawn if t[j] < ONE and not kept[j] else x[c, i, j]
+
+
+@jit
+def _keeps_colour(
+    y: Real, x: Real, clip: Real, i: int, j: int, low: Real, high: Real, own: Real, axes: Real
+) -> bool:
+    """Whether a pixel without a hue, because it clipped, keeps that of `x`; else it gets that around it."""
+    darker = False
+    for c in range(3):
+        darker |= y[c, i, j] >= clip[c] and x[c, i, j] < clip[c]
+    if not darker:
+        return True
+    if low[0, i, j] > high[0, i, j]:  # white all around
+        for c in range(3):
+            x[c, i, j] = max(x[c, i, j], y[c, i, j])
+        return True
+    for k in range(3):
+        axes[k, i, j] = np.float32(0.5) * (low[k, i, j] + high[k, i, j])
+    red, green = axes[0, i, j], axes[1, i, j]  # over green, and over blue
+    own[0, i, j] = np.float32(1.0 / 3.0) * (ONE + np.float32(2.0) * red + green)
+    own[1, i, j] = own[0, i, j] - red
+    own[2, i, j] = own[1, i, j] - green
+    return False
 
 
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)

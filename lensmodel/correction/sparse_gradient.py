@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, ndimage
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
@@ -27,13 +27,14 @@ from lensmodel.correction.blur import (
     Number,
     Real,
     UniformBlur,
+    block_sums,
     spread_blocks,
     to_plane,
     to_spectrum,
     transfers,
 )
 from lensmodel.correction.deconvolver import Sensor, Solution
-from lensmodel.correction.expected_gain import prior
+from lensmodel.correction.expected_gain import prior, wiener_spectrum
 from lensmodel.correction.mosaic import refill, spread_grain
 from lensmodel.correction.richardson_lucy import Lights, fill_canvas
 
@@ -165,58 +166,13 @@ def _pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
 
 
 @jit
-def _wiener(
-    Y: Complex,
-    K: Complex,
-    decay: Real,
-    prior_power: Real,
-    size: int,
-    noise: Number,
-    variance: Number,
-    P: Complex,
-) -> None:
-    """Spectrum of the Wiener estimate; see `expected_gain.wiener_spectrum`."""
-    height, half = Y.shape
-    blurred_prior = np.float64(0.0)
-    for i in range(height):
-        part = ZERO
-        for j in range(half):
-            k = K[i, j]
-            part += prior_power[i, j] * (k.real * k.real + k.imag * k.imag)
-        blurred_prior += part
-    scale = max(variance - noise, 0.005 * variance + 1e-12) / blurred_prior
-    ratio = np.float32(noise / (scale * size))
-    for i in range(height):
-        for j in range(half):
-            k = K[i, j]
-            weight = ONE / (k.real * k.real + k.imag * k.imag + ratio * decay[i, j] + np.float32(1e-9))
-            P[i, j] = Y[i, j] * np.conj(k) * weight
-    P[0, 0] = Y[0, 0] * np.conj(K[0, 0])
-
-
-@jit
 def _drifted(x: Real, drift: Complex, down: Real, across: Real, work: Real, D: Complex, E: Complex) -> None:
     """What the change of the kernel adds to the prediction, as a spectrum, into `E`."""
-    height, width = x.shape
+    E[:] = 0
     for way in range(2):
-        for i in range(height):
-            for j in range(width):
-                work[i, j] = x[i, j] * (down[i] if way == 0 else across[j])
+        work[:] = x * (down.reshape((-1, 1)) if way == 0 else across.reshape((1, -1)))
         to_spectrum(work, D)
-        for i in range(height):
-            for j in range(D.shape[1]):
-                term = drift[way, i, j] * D[i, j]
-                E[i, j] = term if way == 0 else E[i, j] + term
-
-
-@jit
-def _predict(X: Complex, K: Complex, E: Complex, P: Complex) -> None:
-    """Spectrum of the estimate X blurred by K, and what the change of the kernel adds to it, into `P`."""
-    for i in range(P.shape[0]):
-        for j in range(P.shape[1]):
-            P[i, j] = K[i, j] * X[i, j]
-    if E.shape[0] > 0:
-        P += E
+        E += drift[way] * D
 
 
 @jit
@@ -225,8 +181,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     known: NDArray[np.bool_],
     K: Complex,
     noise: Real,
-    variance: Real,
-    prior: tuple[Real, Real],
+    X: Complex,
     gradient_power: Real,
     scale: Real,
     factors: Real,
@@ -235,7 +190,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     prox: Prox,
     moved: tuple[Complex, Real, Real],
 ) -> tuple[Real, Real]:
-    """Wiener start and half-quadratic steps of `SparseGradient` on a canvas.
+    """Half-quadratic steps of `SparseGradient` on a canvas, from the spectrum X of a first estimate.
 
     `known` marks the pixels that hold data: where all do, none needs a prediction. `moved` is the change of K
     per pixel down and across, empty where there is none, and the distances down and across from where the
@@ -244,29 +199,29 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     """
     channels, height, width = y.shape
     half, steps, whole = width // 2 + 1, couplings.size, known.all()
-    (decay, prior_power), (drift, down, across) = prior, moved
+    drift, down, across = moved
     x, explained = np.empty_like(y), np.empty_like(y)
     S = np.empty((channels, height, half), np.complex64)  # of the data, and of what is predicted between them
-    X = np.empty((0 if whole else channels, height, half), np.complex64)
-    E = np.zeros((channels, height, half) if drift.shape[0] > 0 else (0, 0, 0), np.complex64)
+    drifts = drift.shape[0] > 0
+    E = np.zeros((channels, height, half) if drifts else (0, 0, 0), np.complex64)
     D = np.empty((height, half), np.complex64)
     P = np.empty((height, half), np.complex64)
     pull = np.empty_like(x)
     work = np.empty((height, width), np.float32)
     for c in range(channels):
         to_spectrum(y[c], S[c])
-        _wiener(S[c], K[c], decay, prior_power, height * width, noise[c], variance[c], P)
-        if not whole:
-            X[c] = P
+        P[:] = X[c]
         to_plane(P, x[c])
     for step in range(steps):
         _pull_of(x, scale, factors[step], rotation, prox, pull)
         for c in range(channels):
-            if drift.shape[0] > 0 and (step == 0 or step == steps // 2):
+            if drifts and (step == 0 or step == steps // 2):
                 _drifted(x[c], drift[c], down, across, work, D, E[c])
             if not whole:
-                _predict(X[c], K[c], E[c] if drift.shape[0] > 0 else D[:0], P)
-                S[c] = P
+                S[c] = K[c] * X[c]
+                if drifts:
+                    S[c] += E[c]
+                P[:] = S[c]
                 to_plane(P, work)
                 for i in range(height):
                     for j in range(width):
@@ -280,20 +235,17 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                     k = K[c, i, j]
                     power = k.real * k.real + k.imag * k.imag
                     spectrum = S[c, i, j]
-                    if drift.shape[0] > 0:
+                    if drifts:
                         spectrum -= E[c, i, j]
                     P[i, j] = (np.conj(k) * spectrum + weight * P[i, j]) * (
                         ONE / (power + weight * gradient_power[i, j])
                     )
-            if not whole:
-                X[c] = P
+            X[c] = P
             to_plane(P, x[c])
     for c in range(channels):
-        if whole:
-            to_spectrum(x[c], D)
-        else:
-            D[:] = X[c]
-        _predict(D, K[c], E[c] if drift.shape[0] > 0 else D[:0], P)
+        P[:] = K[c] * X[c]
+        if drifts:
+            P += E[c]
         to_plane(P, explained[c])
     return x, explained
 
@@ -397,19 +349,21 @@ class SparseGradient:
         glow: Planes | None,
     ) -> tuple[Planes, Planes]:
         """The planes on the canvas over their `light`, and what they make of the data, blurred again."""
-        blocks = _BlockMeans.of(blurred, light)
-        recorded = blocks if glow is None else _BlockMeans.of(blurred + glow, light)
+        recorded = blurred if glow is None else blurred + glow
         var = np.stack(
             [
-                s.noise.variance(_smoothed(b * bright)) / bright**2
-                for s, b, bright in zip(sensors, recorded.planes, light, strict=True)
+                sensor.noise.variance(_local_means(plane)) / bright**2
+                for sensor, plane, bright in zip(sensors, recorded, light, strict=True)
             ]
         ).astype(np.float32)
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
-        level = np.maximum(_smoothed(blocks.luma), _DARK)
+        luma = (blurred / light[:, None, None]).mean(axis=0)
+        mean = _local_means(luma)
+        level = np.maximum(mean, _DARK)
+        local = _local_means(luma * luma) - mean * mean
         relative = (var / noise[:, None, None]).mean(axis=0)
         shrinkage = Shrinkage.of(self.alpha)
-        calm = _calm(blocks, level, var.mean(axis=0) / len(blurred), self.alpha)
+        calm = _calm(local, level, var.mean(axis=0) / len(blurred), self.alpha)
         threshold = relative * calm / level ** np.float32(self.alpha)
         couplings = self.coupling * self.growth ** np.arange(self.steps)
         K, rates = transfers(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0)
@@ -423,13 +377,13 @@ class SparseGradient:
         y = fill_canvas(canvas, blurred, light, K, blurs, sensors, _LIGHT_STEPS)
         if mosaic:
             refill(y, K, noise, variance, sensors, canvas)
+        start = np.stack([wiener_spectrum(*each) for each in zip(y, K, noise, variance, strict=True)])
         return half_quadratic(
             y,
             _known(sensors, canvas),
             K,
             noise,
-            variance,
-            prior(canvas.shape),
+            start,
             _gradient_power(canvas.shape),
             spread_blocks(shrinkage.scale(threshold), canvas),
             shrinkage.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
@@ -489,15 +443,13 @@ def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:
     return known
 
 
-def _calm(blocks: _BlockMeans, level: Real, noise: Real, alpha: float) -> Real:
+def _calm(local: Real, level: Real, noise: Real, alpha: float) -> Real:
     """How much smoother than an average scene each block is: the factor on kappa.
 
     The maximum-likelihood kappa of a hyper-Laplacian is proportional to E|g|^-alpha; gradients
     scale with the local contrast, so it is (typical over local variance of the signal)^(alpha / 2).
     Without it the flat parts of a picture keep the noise that the inverse of a wide kernel amplifies.
     """
-    mean = _smoothed(blocks.luma)
-    local = _smoothed(blocks.square) - mean * mean
     signal = np.maximum(local - noise, 0.0) + _UNSURE * noise + np.float32(1e-12)
     calm = (_TYPICAL_CONTRAST * level**2 / signal) ** np.float32(alpha / 2)
     return np.asarray(np.clip(calm, _BUSIEST, _CALMEST), dtype=np.float32)
@@ -511,71 +463,9 @@ def _gradient_power(shape: tuple[int, int]) -> Real:
     return (rows[:, None] + cols[None, :]).astype(np.float32)
 
 
-def _smoothed(blocks: Real) -> Real:
-    """Local mean of a coarse plane over about 13 pixels of the fine one."""
+def _local_means(plane: Real) -> Real:
+    """Means over blocks of 4 pixels, smoothed: over about 13 pixels."""
+    plane = block_sums(plane, BLOCK) / block_sums(np.ones_like(plane), BLOCK)
     for axis in (0, 1):
-        sums = np.float32(4.0) * blocks
-        # The same array seen along the other axis: sums are taken in place.
-        lines, into = (blocks, sums) if axis == 0 else (blocks.T, sums.T)
-        into[1:] += lines[:-1]
-        into[:-1] += lines[1:]
-        into[0] += lines[0]
-        into[-1] += lines[-1]
-        blocks = sums
-    blocks *= np.float32(1.0 / 36.0)
-    return blocks
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _BlockMeans:
-    """Means over blocks of a tile whose colours are scaled to equal light."""
-
-    planes: Real  # (channels, rows, cols), of each colour
-    luma: Real  # (rows, cols), of the mean of the colours
-    square: Real  # (rows, cols), of its square
-
-    @classmethod
-    def of(cls, tile: Planes, light: Real) -> _BlockMeans:
-        """Take the means of a tile whose colours have the mean `light`."""
-        shape = tuple(-(-extent // BLOCK) for extent in tile.shape[1:])
-        planes = np.empty((len(tile), *shape), dtype=np.float32)
-        luma, square = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-        _block_means(tile, ONE / light, planes, luma, square)
-        return cls(planes, luma, square)
-
-
-@jit
-def _block_means(  # noqa: C901 - one pass over memory
-    tile: Real, gains: Real, planes: Real, luma: Real, square: Real
-) -> None:
-    """Means over blocks of 4 pixels of planes times `gains`, of their mean, and of its square."""
-    channels, height, width = tile.shape
-    share = ONE / np.float32(channels)
-    line = np.empty(width, np.float32)
-    sums = np.empty((channels + 2, width), np.float32)
-    for row in range(luma.shape[0]):
-        low, high = 4 * row, min(4 * row + 4, height)
-        sums[:] = ZERO
-        for i in range(low, high):
-            line[:] = ZERO
-            for c in range(channels):
-                for j in range(width):
-                    value = tile[c, i, j] * gains[c]
-                    sums[c, j] += value
-                    line[j] += value * share
-            for j in range(width):
-                sums[channels, j] += line[j]
-                sums[channels + 1, j] += line[j] * line[j]
-        for col in range(luma.shape[1]):
-            left, right = 4 * col, min(4 * col + 4, width)
-            size = np.float32((high - low) * (right - left))
-            for c in range(channels + 2):
-                total = ZERO
-                for j in range(left, right):
-                    total += sums[c, j]
-                if c < channels:
-                    planes[c, row, col] = total / size
-                elif c == channels:
-                    luma[row, col] = total / size
-                else:
-                    square[row, col] = total / size
+        plane = ndimage.convolve1d(plane, [1 / 6, 4 / 6, 1 / 6], axis=axis, mode="nearest")
+    return np.asarray(plane, dtype=np.float32)

@@ -135,7 +135,7 @@ def spread_grain(
     coloured: Real = (_AVERAGED[:, None, None] * (ONE - w - w + len(photo) * w * w) * power).sum(axis=0)
     fine: Real = (w * left / bright).sum(axis=0)
     fine[lost] = ZERO
-    near = np.maximum(_smoothed((~lost).astype(np.float32), _BINOMIAL), np.float32(1e-3))
+    near = np.maximum(_smoothed(np.asarray(~lost, dtype=np.float32), _BINOMIAL), np.float32(1e-3))
     fine -= _smoothed(fine, _BINOMIAL) / near
     fine[lost] = ZERO
 

@@ -205,7 +205,6 @@ class CrossValidation:
     errors: NDArray[np.float64]
     noise: NDArray[np.float64]
     factors: tuple[float, float] = (1.0, 1.0)  # on the bandwidths in r and phi
-    spoilt: bool = False  # whether a photo counts for less than half of what it claims
 
 
 def cross_validate(
@@ -236,7 +235,7 @@ def cross_validate(
             return 1.0, 1.0
         return held(searched, weights).best_factors(r=settings.r is None, phi=settings.phi is None)
 
-    factors, weights, spoilt = searched_factors(base), base, False
+    factors, weights = searched_factors(base), base
     prepared = held(scored, base)
     known, own_photo = np.unique(photo[scored], return_inverse=True)
     by_sample, by_photo, held_out = prepared.robust(own_photo, factors)
@@ -245,13 +244,12 @@ def cross_validate(
         of_photos[known] = by_photo
         weights = base * of_photos[photo]
         weights[scored] *= by_sample
-        spoilt = bool((by_photo < _SPOILT).any())
-        if spoilt or bool((by_sample < _SPOILT).any()):
+        if bool((by_photo < _SPOILT).any()) or bool((by_sample < _SPOILT).any()):
             factors = searched_factors(weights)
     scatter = np.minimum(prepared.noise(prepared.weights(*factors)), held_out**2)
     errors[:], noise[:] = float(np.median(held_out)), float(np.median(scatter))
     errors[scored], noise[scored] = held_out, scatter
-    return CrossValidation(weights, errors, noise, factors, spoilt)
+    return CrossValidation(weights, errors, noise, factors)
 
 
 def _held_together(photo: NDArray[np.intp], octaves: NDArray[np.float64]) -> NDArray[np.intp]:

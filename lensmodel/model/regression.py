@@ -40,7 +40,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
 
@@ -127,10 +127,6 @@ class Regression:
         self._widths = WidthField() if settings.mode == PAPER else WidthField.fit(common, base)
         self._local = LocalKernels.of(common, points, self._widths)
         self._validation = cross_validate(common, settings, self._local.upright, points, base)
-        if self._validation.spoilt:  # that photo has bent the widths too: fit them again without it
-            self._widths = WidthField.fit(common, self._validation.weights)
-            self._local = replace(self._local, widths=self._widths.over(points))
-            self._validation = cross_validate(common, settings, self._local.upright, points, base)
         self._where = va.all_in_units(common)
         # what the estimators expect of their samples; 0 where they expect nothing
         self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])

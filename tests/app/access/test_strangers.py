@@ -24,9 +24,6 @@ JSON = {"Content-Type": "application/json"}
 PATIENCE_S = 60.0
 
 
-# --- bodies -----------------------------------------------------------------------------------
-
-
 def test_json_is_read_to_the_limit_and_declared_as_such(client: TestClient) -> None:
     def post(content: bytes | Iterator[bytes], **headers: str) -> Any:
         return client.post("/v1/corrections", content=content, headers={**JSON, **headers})
@@ -103,8 +100,6 @@ def test_only_so_many_photos_are_received_at_once(
     assert (taken.status_code, places._value) == (202, photos.MAX_UPLOADS)
 
 
-# --- other sites ------------------------------------------------------------------------------
-
 FOREIGN = [
     {"Origin": "https://evil.example"},
     {"Origin": "null"},
@@ -176,9 +171,6 @@ def test_the_interface_is_shown_with_every_operation(client: TestClient) -> None
 
     assert [path for path in client.get("/openapi.json").json()["paths"] if path not in page] == []
     assert "<script>" not in page
-
-
-# --- the log ----------------------------------------------------------------------------------
 
 
 def test_the_log_names_requests_without_their_query_and_no_path_forges_a_line(

@@ -19,7 +19,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -161,43 +161,34 @@ def fault_of(reader: Reader, path: Path, lines: Lines) -> str:
     return f"took {took:.0f} s" if took > SLOW_S else ""
 
 
-def rounds(minutes: float, seed: int, keep: Path) -> Iterator[tuple[str, Path, str]]:
-    """Feed for some minutes; give each fault as reader, file and reason; print a summary at the end."""
-    rng, lines, done = random.Random(seed), Lines(), Counter[str]()
+def main() -> int:
+    """Run for the time that was asked for; print each kind of fault once, and a summary."""
+    wishes = programs.wishes(__doc__, minutes=10.0, seed=0, keep=Path("bench-output/fuzz"))
+    rng, lines, done, faults = random.Random(wishes.seed), Lines(), Counter[str](), Counter[str]()
     with tempfile.TemporaryDirectory() as scratch:
         seeds = Path(scratch)
         write_seeds(seeds)
         pools = {name: [(seeds / file).read_bytes()] for name, (file, _) in READERS.items()}
         every = [pool[0] for pool in pools.values()]
-        names = itertools.cycle(READERS)
-        end = time.monotonic() + 60.0 * minutes
+        names, end = itertools.cycle(READERS), time.monotonic() + 60.0 * wishes.minutes
         while time.monotonic() < end:
             name = next(names)
             file, reader = READERS[name]
-            data = damaged(rng.choice(pools[name]), every, rng)
-            path = seeds / f"try-{file}"
+            data, path = damaged(rng.choice(pools[name]), every, rng), seeds / f"try-{file}"
             path.write_bytes(data)
             reason = fault_of(reader, path, lines)
             done[name] += 1
             if lines.fresh:
                 pools[name] = [pools[name][0], *pools[name][1:][-POOL:], data]
             if reason:
-                kept = keep / f"{name.replace(' ', '-')}-{done[name]}"
-                keep.mkdir(parents=True, exist_ok=True)
+                kept = wishes.keep / f"{name.replace(' ', '-')}-{done[name]}"
+                kind = f"{name}: {reason.strip().splitlines()[-1]}"
+                wishes.keep.mkdir(parents=True, exist_ok=True)
                 kept.write_bytes(data)
-                yield name, kept, reason
+                if not faults[kind]:
+                    print(f"FAULT {name}: {kept}\n{reason}")
+                faults[kind] += 1
     print(json.dumps({"files": dict(done), "lines of our code reached": len(lines.known)}))
-
-
-def main() -> int:
-    """Run for the time that was asked for."""
-    wishes = programs.wishes(__doc__, minutes=10.0, seed=0, keep=Path("bench-output/fuzz"))
-    faults = Counter[str]()
-    for name, path, reason in rounds(wishes.minutes, wishes.seed, wishes.keep):
-        last = reason.strip().splitlines()[-1]
-        if not faults[f"{name}: {last}"]:
-            print(f"FAULT {name}: {path}\n{reason}")
-        faults[f"{name}: {last}"] += 1
     print(f"{sum(faults.values())} faults of {len(faults)} kinds")
     return 1 if faults else 0
 

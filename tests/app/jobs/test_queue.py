@@ -278,9 +278,6 @@ def test_reading_ahead_pauses_in_an_outage_but_keeps_to_no_photo_for_ever(
     assert 60.0 < sum(pauses) < 180.0
 
 
-# --- retries ----------------------------------------------------------------------------------
-
-
 def failed(steps: Steps, kind: Kind) -> str:
     """Let a photo or a correction fail; return its id."""
     if kind == "photo":

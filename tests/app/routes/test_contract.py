@@ -38,9 +38,6 @@ def filled(client: TestClient, steps: Steps) -> Filled:
     return lambda text: re.sub("|".join(ids), lambda name: ids[name[0]], text)
 
 
-# --- lists ------------------------------------------------------------------------------------------
-
-
 def jobs(steps: Steps, number: int) -> list[str]:
     photo = steps.counted()
     asked = {"method": "fast", "output": {"format": "png8"}, "roi": None}
@@ -71,9 +68,6 @@ def test_pages_join_without_gap_or_overlap(client: TestClient, steps: Steps, pat
     assert seen == made[::-1]
 
 
-# --- one thing --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "path",
     ["/v1/jobs/PHOTO", "/v1/jobs/CORRECTION", "/v1/corrections/CORRECTION/result", "/ui/parts?page=home"],
@@ -94,8 +88,6 @@ def test_an_unknown_id_is_a_plain_404(client: TestClient, kind: str) -> None:
 
         assert told in {(404, f"unknown_{kind}"), (404, "not_found")}, bad
 
-
-# --- what makes no sense ----------------------------------------------------------------------------
 
 INVALID = "invalid_parameter"
 NEW = {"label": "mine"}
@@ -171,9 +163,6 @@ def test_bad_json_is_a_problem_and_not_a_crash(client: TestClient, filled: Fille
 
         assert answer.status_code in {400, 422}
         assert answer.headers["content-type"] == "application/problem+json"
-
-
-# --- the service ------------------------------------------------------------------------------------
 
 
 def test_readiness_is_looked_up_once_and_changes_nothing(

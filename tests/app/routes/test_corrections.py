@@ -91,35 +91,23 @@ def test_a_photo_with_other_settings_is_corrected_anew(client: TestClient, steps
     assert row.params["settings"]["aperture"] == 8.0
 
 
-def test_a_photo_not_yet_read_asks_for_patience(client: TestClient, steps: Steps) -> None:
-    lens_id = steps.lens_id(steps.counted())
-    unread = steps.receive(calibrate=False).public_id
-
-    for answer in (post(client, photo_id=unread), post(client, photo_id=unread, lens_id=lens_id)):
-        assert refusal(answer) == (409, "not_ready")
-        assert "retry-after" in answer.headers
-
-
-def test_a_photo_of_another_lens_is_refused_until_its_owner_insists(client: TestClient, steps: Steps) -> None:
-    wish = {"lens_id": steps.lens_id(steps.counted(serial="1"))}
-    wish["photo_id"] = steps.counted(serial="2").public_id
-
-    refused = post(client, **wish)
-
-    assert refusal(refused) == (409, "other_lens")
-    assert "its serial number is 2, that of the lens 1" in refused.json()["detail"]
-    assert post(client, **wish, any_lens=True).status_code == 202
-
-
-def test_without_a_lens_that_is_known_nothing_is_corrected(client: TestClient, steps: Steps) -> None:
-    nameless, first = stored(steps, serial=None), steps.receive()
+def test_what_cannot_be_corrected_yet_says_why(client: TestClient, steps: Steps) -> None:
+    lens_id, unread = steps.lens_id(steps.counted(serial="1")), steps.receive(calibrate=False).public_id
+    first, nameless = steps.receive(), stored(steps, serial=None)
     steps.inspect(first)
 
-    answer = post(client, photo_id=nameless.public_id)
-
-    assert refusal(answer) == (422, "metadata_missing")
-    assert "lens_id" in answer.json()["detail"]
+    for early in (post(client, photo_id=unread), post(client, photo_id=unread, lens_id=lens_id)):
+        assert refusal(early) == (409, "not_ready")
+        assert "retry-after" in early.headers
+    lensless = post(client, photo_id=nameless.public_id)
+    assert refusal(lensless) == (422, "metadata_missing")
+    assert "lens_id" in lensless.json()["detail"]
     assert refusal(post(client, photo_id=first.public_id)) == (409, "no_samples")
+    wish = {"lens_id": lens_id, "photo_id": steps.counted(serial="2").public_id}
+    foreign = post(client, **wish)
+    assert refusal(foreign) == (409, "other_lens")
+    assert "its serial number is 2, that of the lens 1" in foreign.json()["detail"]
+    assert post(client, **wish, any_lens=True).status_code == 202
 
 
 def test_a_preview_belongs_to_its_page_which_deletes_it(client: TestClient, photo: str) -> None:

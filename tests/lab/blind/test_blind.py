@@ -90,9 +90,6 @@ def report() -> BlindReport:
     return run(narrow=Fake(0.3), wide=Fake(9.0), shy=Declining())
 
 
-# ---- the judge
-
-
 @pytest.fixture(scope="module")
 def scene() -> Plane:
     return scene_of(list_photos()[3])[1][:192, :192]
@@ -128,9 +125,6 @@ def test_padding_joins_without_a_jump() -> None:
     assert np.abs(padded[0] - padded[-1]).max() <= largest_step
     assert np.abs(padded[:, 0] - padded[:, -1]).max() <= largest_step
     np.testing.assert_array_equal(padded[28:-28, 28:-28], ramp)
-
-
-# ---- error ratio
 
 
 @dataclass(frozen=True)
@@ -170,9 +164,6 @@ def test_harm_is_told_from_declining_which_leaves_the_patch(
     assert [row.declined for row in left] == [row.method == "shy" for row in left]
     assert len(left) == 6
     assert all(row.error_ratio == row.untouched_ratio and not row.improved for row in left)
-
-
-# ---- cases
 
 
 def test_halves_share_no_photo_and_no_psf() -> None:
@@ -249,9 +240,6 @@ def test_bad_settings_are_named(tmp_path: Path) -> None:
         list_photos(tmp_path)
 
 
-# ---- cache
-
-
 def test_a_second_run_computes_nothing_and_a_stopped_one_goes_on_where_it_was(tmp_path: Path) -> None:
     first, second, third = Fake(), Fake(), Fake()
     one = run(tmp_path, fake=first)
@@ -289,9 +277,6 @@ def test_numbers_do_not_depend_on_the_number_of_processes() -> None:
     one, two = (run_blind_benchmark(wanted, workers=n) for n in (1, 2))
 
     assert [r.error_ratio for r in one.results] == [r.error_ratio for r in two.results]
-
-
-# ---- report
 
 
 def result(ratio: float, method: str = "m", untouched: float = 3.0) -> CaseResult:

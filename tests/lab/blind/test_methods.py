@@ -116,9 +116,6 @@ def test_camera_shake_is_recovered(shared_data: Path, name: str, median: float, 
     assert np.median(nothing) < 0.55
 
 
-# ---- the edges of Sun
-
-
 def cost(y: Plane, sharp: NDArray[np.float64], kernel: Kernel) -> float:
     """Cost of the kernel step for one kernel when the sharp scene is known."""
     view = View(y.astype(np.float64), SIGMA)
@@ -157,8 +154,6 @@ def test_a_sharp_step_stays_and_a_soft_one_becomes_steeper() -> None:
     assert np.abs(np.diff(steeper, axis=1)[inner]).max() > 1.3 * np.abs(np.diff(soft, axis=1)[inner]).max()
     assert np.array_equal(steeper[count == 0], soft[count == 0])
 
-
-# ---- the posterior of Zhang
 
 FLOOR = 1e-4 + 2 * SIGMA**2
 

@@ -86,9 +86,6 @@ def stepped(ringing: float) -> tuple[Shown, Shown]:
     return grey(0.3 + 0.4 * step), grey(0.3 + 0.4 * (sharp + ringing * halo))
 
 
-# --- dots and hues -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("value", [0.0, 1.0])
 @pytest.mark.parametrize("channel", [0, 1, 2])
 def test_dots_are_found_where_they_were_put_and_pairs_of_them_too(value: float, channel: int) -> None:
@@ -159,9 +156,6 @@ def test_pixels_of_another_hue_are_flips_unless_the_truth_has_them(sky: Any, gro
     assert not hue_flips(before, after, after).any()
 
 
-# --- edges ---------------------------------------------------------------------------------------
-
-
 def test_overshoot_of_a_known_halo_is_measured() -> None:
     found = overshoots(*stepped(0.2))
 
@@ -197,9 +191,6 @@ def test_a_line_beside_an_edge_is_no_halo_where_the_original_or_the_truth_shows_
     assert len(overshoots(before, sharp)) < 5
 
 
-# --- grain ---------------------------------------------------------------------------------------
-
-
 def test_grain_ratio_is_the_square_of_a_factor_in_every_band_and_smoothing_shows_in_the_fine_one() -> None:
     before = even(256, 256)
 
@@ -231,9 +222,6 @@ def test_a_scene_without_an_even_place_has_no_grain_ratio() -> None:
     assert grain_ratio(grain(scene, scene)) is None
 
 
-# --- truth ---------------------------------------------------------------------------------------
-
-
 def test_gains_against_the_truth_are_those_of_the_errors_and_a_ruined_block_is_found() -> None:
     truth = leaves(300, 420)
     noise = np.random.default_rng(4).normal(size=truth.shape)
@@ -258,9 +246,6 @@ def test_a_shift_costs_nothing() -> None:
     found = gains(blurred(truth, 0.7), moved, truth)
     assert found is not None
     assert found.worst_db > 5.0
-
-
-# --- all of it -----------------------------------------------------------------------------------
 
 
 def stored(picture: Shown) -> NDArray[np.uint16]:
@@ -310,9 +295,6 @@ def test_crops_are_squares_of_three_pixels_side_by_side() -> None:
     assert made.shape == (8 * ZOOM, 2 * 8 * ZOOM + 6, 3)
     assert (made[:3, :3] == picture[10, 10] // 257).all()
     assert (made[:3, -3:] == picture[::-1][10, 17] // 257).all()
-
-
-# --- the page ------------------------------------------------------------------------------------
 
 
 @pytest.fixture

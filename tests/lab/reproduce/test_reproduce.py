@@ -78,8 +78,6 @@ def photographs(folder: Path, count: int) -> tuple[Path, ...]:
     return tuple(paths)
 
 
-# --- planning ----------------------------------------------------------------------------------
-
 HELIAR, TELEPHOTO = repository_grids()
 
 
@@ -136,9 +134,6 @@ def test_only_lenses_that_are_named_are_run() -> None:
         planned("quick", lenses=["sonnar"])
 
 
-# --- fields to compare with --------------------------------------------------------------------
-
-
 class EvenField:
     """A field that is the same under every turn of the frame about its middle, and under its mirror.
 
@@ -188,9 +183,6 @@ def test_flow_gives_the_psfs_of_its_windows_in_their_middles_and_their_mean_betw
     assert distance(flow(between), left).rel_l2 > 0.04
 
 
-# --- scenes ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("count", [3, 6, 13])
 def test_photographs_of_the_held_out_photo_serve_in_no_other(tmp_path: Path, count: int) -> None:
     files = photographs(tmp_path, count)
@@ -234,9 +226,6 @@ def test_cut_leaves_an_even_margin_of_half_a_kernel_at_most() -> None:
         centred_cut(scene, 100, 200)
 
 
-# --- keys --------------------------------------------------------------------------------------
-
-
 def test_key_changes_with_settings_and_code() -> None:
     one = case()
     keys = {key_of(one, plan(), "1"), key_of(one, plan(), "2"), key_of(case(seed=1002), plan(), "1")}
@@ -263,9 +252,6 @@ def test_version_follows_what_is_imported_anywhere(tmp_path: Path) -> None:
     assert version_of("pkg.a", root=tmp_path) == first
     (tmp_path / "pkg" / "c.py").write_text("changed = 1")
     assert version_of("pkg.a", root=tmp_path) != first
-
-
-# --- tables and page, from made-up results -----------------------------------------------------
 
 
 def state(mtf50: float, psnr: float) -> dict[str, Any]:
@@ -434,9 +420,6 @@ def test_json_holds_results_summary_and_bars(tmp_path: Path) -> None:
     assert {"name", "place", "value", "low", "high", "met"} <= stored["bars"][0].keys()
 
 
-# --- measuring ---------------------------------------------------------------------------------
-
-
 def test_true_kernels_have_no_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -505,9 +488,6 @@ def test_parts_lie_in_the_frame_and_meet_every_zone(frame: Frame) -> None:
     places = [(r + u * h, c + u * w) for r, c, h, w in found for u in (0.1, 0.5, 0.9)]
     assert {zone_of(frame.position(*place).r) for place in places} == set(ZONES)
     assert sum(h * w for _, _, h, w in found) < 0.5 * frame.height * frame.width or frame.height < 1000
-
-
-# --- running -----------------------------------------------------------------------------------
 
 
 class Nothing:

@@ -9,6 +9,7 @@ import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,15 +23,8 @@ from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta
 from lensmodel.core.types import FieldPosition, LensSettings
 
 PATCH = EncodedPatch(np.ones(9, dtype=np.float16), np.ones(TOKEN_LENGTH, dtype=np.float16))
-SAMPLE = PsfSample(
-    gaussian(5, np.eye(2)),
-    FieldPosition(0.4, 0.3),
-    LensSettings(2.8, channel="b"),
-    weight=0.25,
-    estimator="quick/1",
-    encoded=PATCH,
-    error=0.2,
-)
+ABOUT: dict[str, Any] = {"weight": 0.25, "estimator": "quick/1", "encoded": PATCH, "error": 0.2}
+SAMPLE = PsfSample(gaussian(5, np.eye(2)), FieldPosition(0.4, 0.3), LensSettings(2.8, channel="b"), **ABOUT)
 Damage = Callable[[Path], object]
 
 
@@ -63,16 +57,10 @@ def changed(**values: object) -> Damage:
     return damage
 
 
-def archived() -> bytes:
-    written = io.BytesIO()
-    np.savez(written, np.ones((1, 5, 5), dtype=np.float32))
-    return written.getvalue()
-
-
-def boundless() -> bytes:
-    written, head = io.BytesIO(), {"descr": "<f4", "fortran_order": False, "shape": (1, 10**9, 10**9)}
-    np.lib.format.write_array_header_1_0(written, head)
-    return written.getvalue()
+ARCHIVE, BOUNDLESS = io.BytesIO(), io.BytesIO()
+np.savez(ARCHIVE, np.ones((1, 5, 5), dtype=np.float32))
+HEAD = {"descr": "<f4", "fortran_order": False, "shape": (1, 10**9, 10**9)}
+np.lib.format.write_array_header_1_0(BOUNDLESS, HEAD)
 
 
 @pytest.mark.parametrize(
@@ -81,8 +69,8 @@ def boundless() -> bytes:
         put(KERNELS, b""),
         put(KERNELS, b"PK\x03\x04" + bytes(40)),
         put(KERNELS, pickle.dumps(np.ones((1, 5, 5)))),
-        put(KERNELS, archived()),
-        put(KERNELS, boundless()),
+        put(KERNELS, ARCHIVE.getvalue()),
+        put(KERNELS, BOUNDLESS.getvalue()),
         put(KERNELS, np.ones((1, 5, 5))),
         put(KERNELS, np.ones((2, 5, 5), dtype=np.float32)),
         put(KERNELS, np.ones((5, 5), dtype=np.float32)),

@@ -25,7 +25,7 @@ COMPACT = Camera("EASTMAN KODAK COMPANY", "KODAK Z612 ZOOM DIGITAL CAMERA", None
 KODAK, SPELT = Camera(None, "Kodak Z612"), Camera("Eastman", "KODAK Z612")
 IPHONE, IPHONE_A, IPHONE_B = (Camera("Apple", "iPhone 6", serial) for serial in (None, "A", "B"))
 
-SAYS_NOTHING = Identity()
+SAYS_NOTHING, EF35_ON_EOS = Identity(), Identity({"model": "EF35mm f/2"}, [EOS])
 CANON_ON_EOS, OF_EOS, OF_COMPACT = Identity(CANON, [EOS]), Identity({}, [EOS]), Identity({}, [COMPACT])
 
 
@@ -40,10 +40,8 @@ def test_a_lens_is_known_however_a_program_writes_its_name() -> None:
     ("known", "seen"),
     [
         (CANON_ON_EOS, Identity(CANON, [Camera("Canon", "Canon EOS R5", "9")])),  # on another body
-        (
-            CANON_ON_EOS,
-            Identity({"maker": "Canon"}, [Camera("Canon", "EOS 5D", "77")]),
-        ),  # unnamed, same model
+        # unnamed, of the same model
+        (CANON_ON_EOS, Identity({"maker": "Canon"}, [Camera("Canon", "EOS 5D", "77")])),
         (Identity(CANON), OF_COMPACT),  # a profile need not say its camera
         (CANON_ON_EOS, SAYS_NOTHING),  # as a scan
         (OF_COMPACT, OF_COMPACT),
@@ -66,18 +64,14 @@ def test_nothing_speaks_against_one_lens(known: Identity, seen: Identity) -> Non
 @pytest.mark.parametrize(
     ("known", "seen", "why"),
     [
-        (
-            CANON_ON_EOS,
-            Identity({"model": "EF35mm f/2"}, [EOS]),
-            "of the EF35mm f/2, and the lens is the EF24mm",
-        ),
+        (CANON_ON_EOS, EF35_ON_EOS, "of the EF35mm f/2, and the lens is the EF24mm"),
         (Identity(ACME), Identity(ACME | {"serial": "2"}), "number is 2, that of the lens 1"),
         (Identity(ACME), Identity({"maker": "Other", "model": "Acme 42mm"}), "a lens of Other"),
         (CANON_ON_EOS, OF_COMPACT, "taken with another camera, KODAK"),
         (OF_COMPACT, OF_EOS, "taken with another camera, Canon EOS 5D"),
         (OF_COMPACT, CANON_ON_EOS, "names its lens, EF24mm f/1.4L II USM ab-1, and .* none"),
         (Identity(focals_mm=[24.0]), Identity(CANON), "names its lens"),
-        (OF_EOS, Identity({"model": "EF35mm f/2"}, [EOS]), "names its lens"),
+        (OF_EOS, EF35_ON_EOS, "names its lens"),
         (Identity(LABELLED, [EOS]), Identity({"model": "50mm"}, [COMPACT]), "another camera, KODAK"),
         (OF_EOS, Identity({}, [OTHER_EOS]), "another copy of the camera"),
         (Identity(PHONE, [IPHONE_A]), Identity(PHONE, [IPHONE_B]), "another copy of the camera"),

@@ -15,26 +15,8 @@ from scipy import ndimage, signal
 from lab import cases as making
 from lab import kernels
 from lab.blind import benchmark, judge
-from lab.blind.benchmark import (
-    UNTOUCHED,
-    BlindBenchmark,
-    BlindReport,
-    CaseResult,
-    curve_figure,
-    markdown_table,
-    run_blind_benchmark,
-    summarised,
-    write_report,
-)
-from lab.cases import (
-    _apart,
-    list_photos,
-    load_psfs,
-    make_cases,
-    observe,
-    photo_half,
-    scene_of,
-)
+from lab.blind.benchmark import BlindBenchmark, BlindReport, CaseResult, run_blind_benchmark, summarised
+from lab.cases import _apart, list_photos, load_psfs, make_cases, observe, photo_half, scene_of
 from lab.stored import ROOT
 from lensmodel.blind import PsfEstimate
 from lensmodel.core import psf
@@ -157,7 +139,7 @@ def test_harm_is_told_from_declining_which_leaves_the_patch(
     report: BlindReport,
 ) -> None:
     wide = next(row for row in summarised(report.results) if row["method"] == "wide")
-    left = [row for row in report.results if row.method in {UNTOUCHED, "shy"}]
+    left = [row for row in report.results if row.method in {benchmark.UNTOUCHED, "shy"}]
 
     assert wide["improved"] == 0.0
     assert wide["width_ratio"] > 1.5
@@ -295,14 +277,14 @@ def test_summary_counts_what_it_says() -> None:
 
 
 def test_report_has_a_row_and_a_curve_for_each_method_and_no_nan(report: BlindReport, tmp_path: Path) -> None:
-    files = {path.name for path in write_report(report, tmp_path)}
+    files = {path.name for path in benchmark.write_report(report, tmp_path)}
     stored = json.loads((tmp_path / "blind.json").read_text(), parse_constant=pytest.fail)
-    (axes,) = curve_figure(report, 0.01).axes
+    (axes,) = benchmark.curve_figure(report, 0.01).axes
 
     assert files == {"blind.json", "blind.md", "blind-er-1percent.svg", "blind-er-1percent.png"}
-    assert [row["method"] for row in stored["summary"]] == [UNTOUCHED, "narrow", "wide", "shy"]
+    assert [row["method"] for row in stored["summary"]] == [benchmark.UNTOUCHED, "narrow", "wide", "shy"]
     assert len(stored["cases"]) == 12
-    assert markdown_table(report).count("\n") == 2 + 4
+    assert benchmark.markdown_table(report).count("\n") == 2 + 4
     names = [text.get_text() for text in axes.get_legend().get_texts()]
     assert set(names) >= {"narrow", "wide", "no correction"}
     dashed = [line.get_label() for line in axes.get_lines() if line.get_linestyle() == "--"]

@@ -14,26 +14,8 @@ from scipy import ndimage, special
 
 import lensmodel
 from lab.gallery import page as shown_page
-from lab.gallery.figures import (
-    dots,
-    grain,
-    grain_ratio,
-    hue_flips,
-    overshoots,
-    percentile_of_edges,
-)
-from lab.gallery.page import (
-    TILE,
-    ZOOM,
-    GalleryEntry,
-    bars,
-    entries_of,
-    measured,
-    places,
-    sheet,
-    text,
-    write_page,
-)
+from lab.gallery.figures import dots, grain, grain_ratio, hue_flips, overshoots, percentile_of_edges
+from lab.gallery.page import TILE, GalleryEntry, bars, entries_of, measured, places, sheet, text, write_page
 from lab.gallery.pictures import FRAMES, Picture, chosen, real_pictures, rendered, take
 from lab.images import gains
 from lab.kernels import gaussian
@@ -292,7 +274,7 @@ def test_crops_are_squares_of_three_pixels_side_by_side() -> None:
 
     made = sheet([picture, picture[::-1]], 10, 10, 8)
 
-    assert made.shape == (8 * ZOOM, 2 * 8 * ZOOM + 6, 3)
+    assert made.shape == (8 * shown_page.ZOOM, 2 * 8 * shown_page.ZOOM + 6, 3)
     assert (made[:3, :3] == picture[10, 10] // 257).all()
     assert (made[:3, -3:] == picture[::-1][10, 17] // 257).all()
 

@@ -18,29 +18,8 @@ from scipy import ndimage
 
 from lab.images import EVERY, blocks, fidelity, to_srgb
 from lab.kernels import distance
-from lab.reproduce import job, measure
-from lab.reproduce.cases import (
-    BEFORE,
-    FIRST_SEED,
-    GENERAL,
-    MEASURED,
-    PAPER_WAY,
-    RIVAL,
-    SOFT_SEED,
-    TRUE,
-    Case,
-    Reproduction,
-    Shots,
-    centred_cut,
-    frame_scene,
-    in_container,
-    key_of,
-    layout_for,
-    photos_of,
-    planned,
-    repository_grids,
-    scene_files,
-)
+from lab.reproduce import cases, job, measure
+from lab.reproduce.cases import BEFORE, PAPER_WAY, RIVAL, TRUE, Case, Reproduction, key_of, planned
 from lab.reproduce.fields import MeanField, general_field, symmetric
 from lab.reproduce.figures import Flow
 from lab.reproduce.job import paper_way, run_reproduction
@@ -78,7 +57,7 @@ def photographs(folder: Path, count: int) -> tuple[Path, ...]:
     return tuple(paths)
 
 
-HELIAR, TELEPHOTO = repository_grids()
+HELIAR, TELEPHOTO = cases.repository_grids()
 
 
 def traced(path: Path = HELIAR, **changes: Any) -> Case:
@@ -89,12 +68,12 @@ def traced(path: Path = HELIAR, **changes: Any) -> Case:
 def test_plan_has_eight_kinds_of_lenses_of_both_families_and_says_which_were_looked_at() -> None:
     drawn = [one for one in planned("default").cases if one.grid is None]
     assert len({one.lens.model.split()[1] for one in drawn}) == len(LENS_KINDS) == 8
-    assert min(one.seed for one in drawn) >= FIRST_SEED
-    cases = planned("quick").cases
-    assert [one.family for one in cases] == ["third order"] * 2 + ["ray-traced"] * 2
-    assert [one.unseen for one in cases] == [True, True, False, False]
-    assert {one.name.partition("-")[0] for one in cases} == {"1008", "1004", "heliar", "reverse"}
-    assert len({one.seed for one in cases}) == 4
+    assert min(one.seed for one in drawn) >= cases.FIRST_SEED
+    quick = planned("quick").cases
+    assert [one.family for one in quick] == ["third order"] * 2 + ["ray-traced"] * 2
+    assert [one.unseen for one in quick] == [True, True, False, False]
+    assert {one.name.partition("-")[0] for one in quick} == {"1008", "1004", "heliar", "reverse"}
+    assert len({one.seed for one in quick}) == 4
 
 
 def test_traced_case_has_the_pitch_the_aperture_and_the_truth_of_its_grid() -> None:
@@ -186,9 +165,9 @@ def test_flow_gives_the_psfs_of_its_windows_in_their_middles_and_their_mean_betw
 @pytest.mark.parametrize("count", [3, 6, 13])
 def test_photographs_of_the_held_out_photo_serve_in_no_other(tmp_path: Path, count: int) -> None:
     files = photographs(tmp_path, count)
-    layout = layout_for(files)
-    held = frame_scene(files, layout, None)
-    learned = [frame_scene(files, layout, i) for i in range(5)]
+    layout = cases.layout_for(files)
+    held = cases.frame_scene(files, layout, None)
+    learned = [cases.frame_scene(files, layout, i) for i in range(5)]
     rows, cols = layout.tile
     assert held.shape == (3, layout.rows * rows, layout.cols * cols)
     assert not set(np.unique(held[0])) & {level for scene in learned for level in np.unique(scene[0])}
@@ -199,39 +178,39 @@ def test_a_photograph_that_serves_again_is_mirrored(tmp_path: Path) -> None:
     for name in "ab":
         Image.fromarray(levels.astype(np.uint8)).save(tmp_path / f"{name}.png")
     files = sorted(tmp_path.iterdir())
-    first, second, third = (frame_scene(files, layout_for(files), i) for i in range(3))
+    first, second, third = (cases.frame_scene(files, cases.layout_for(files), i) for i in range(3))
     np.testing.assert_array_equal(second, first[:, :, ::-1])
     np.testing.assert_array_equal(third, first[:, ::-1])
 
 
 def test_smallest_grid_that_covers_a_wanted_frame_is_taken(tmp_path: Path) -> None:
     paths = photographs(tmp_path, 12)
-    assert (layout_for(paths).rows, layout_for(paths).cols) == (2, 2)
-    assert (layout_for(paths, (80, 140)).rows, layout_for(paths, (80, 140)).cols) == (1, 1)
+    assert (cases.layout_for(paths).rows, cases.layout_for(paths).cols) == (2, 2)
+    assert (cases.layout_for(paths, (80, 140)).rows, cases.layout_for(paths, (80, 140)).cols) == (1, 1)
     for files, frame, why in ((paths, (400, 600), "give larger ones"), (paths[:1], None, "two photographs")):
         with pytest.raises(InvalidInputError, match=why):
-            layout_for(files, frame)
+            cases.layout_for(files, frame)
 
 
 def test_only_the_test_half_of_a_folder_is_used(tmp_path: Path) -> None:
     for name in ("s01_city_sunset", "s03_lake_mountains"):
         Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.png")
-    assert [path.stem for path in scene_files(tmp_path)] == ["s01_city_sunset"]
+    assert [path.stem for path in cases.scene_files(tmp_path)] == ["s01_city_sunset"]
 
 
 def test_cut_leaves_an_even_margin_of_half_a_kernel_at_most() -> None:
     scene = np.zeros((3, 161, 140), dtype=np.float32)
-    assert centred_cut(scene, 100, 100).shape == (3, 156, 140)
+    assert cases.centred_cut(scene, 100, 100).shape == (3, 156, 140)
     with pytest.raises(InvalidInputError, match="cover"):
-        centred_cut(scene, 100, 200)
+        cases.centred_cut(scene, 100, 200)
 
 
 def test_key_changes_with_settings_and_code() -> None:
     one = case()
     keys = {key_of(one, plan(), "1"), key_of(one, plan(), "2"), key_of(case(seed=1002), plan(), "1")}
     assert len(keys) == 3
-    assert photos_of(one, plan()) == photos_of(one, plan(compare=True))
-    assert photos_of(one, plan()) != photos_of(replace(one, width=320), plan())
+    assert cases.photos_of(one, plan()) == cases.photos_of(one, plan(compare=True))
+    assert cases.photos_of(one, plan()) != cases.photos_of(replace(one, width=320), plan())
     assert key_of(case(), plan(), "1") in keys
 
 
@@ -361,7 +340,7 @@ def test_colours_are_judged_by_their_ratio_to_green() -> None:
 
 def test_the_soft_fast_lens_is_judged_by_itself() -> None:
     made = result((190, 33.0), (190, 33.0))
-    made["cases"][1]["settings"]["seed"] = SOFT_SEED
+    made["cases"][1]["settings"]["seed"] = cases.SOFT_SEED
     made["cases"][1]["psf"]["n = 1"]["rel_l2"]["g"]["center"] = 0.29
     found = [bar for bar in bars(made) if bar.family == "soft fast lens"]
     assert [(bar.place, bar.met) for bar in found][:2] == [("center", True), ("mid", True)]
@@ -388,8 +367,12 @@ def test_families_are_judged_and_shown_apart() -> None:
 def test_page_shows_every_way_lens_and_refusal_and_needs_nothing_from_outside(tmp_path: Path) -> None:
     made, way, bench = result((160, 32.0), (120, 29.0)), f"{PAPER_WAY}, n = 1", tmp_path / "bench"
     one, other = made["cases"]
-    one["states"] |= {way: state(140, 31.5), GENERAL: state(145, 31.6), MEASURED: state(195, 33.9)}
-    one["psf"] |= {way: psf(0.6), GENERAL: psf(0.6), MEASURED: psf(0.6)}
+    one["states"] |= {
+        way: state(140, 31.5),
+        cases.GENERAL: state(145, 31.6),
+        cases.MEASURED: state(195, 33.9),
+    }
+    one["psf"] |= {way: psf(0.6), cases.GENERAL: psf(0.6), cases.MEASURED: psf(0.6)}
     one["refused"]["n = 1"] = ["photo-00: flat"]
     other |= {"family": "ray-traced", "unseen": False, "title": "Traced Heliar"}
     assert collected(bench, tmp_path) is None
@@ -399,7 +382,7 @@ def test_page_shows_every_way_lens_and_refusal_and_needs_nothing_from_outside(tm
     made["figures"]["fig1"] = collected(bench, tmp_path / "pictures")
 
     markdown, html = (path.read_text(encoding="utf-8") for path in write_page(made, tmp_path))
-    assert list(summary(made)["psnr"]) == [BEFORE, RIVAL, GENERAL, way, "n = 1", MEASURED, TRUE]
+    assert list(summary(made)["psnr"]) == [BEFORE, RIVAL, cases.GENERAL, way, "n = 1", cases.MEASURED, TRUE]
     shown = ["| third order | Lens &lt;0&gt; | drawn, seed 1000 | unseen |", "photo-00: flat", "MISSED"]
     shown += ["| ray-traced | Traced Heliar | drawn, seed 1001 | looked at during development |"]
     shown += ["| default, n = 1 | 160 |", f"| {RIVAL} | 130 |", "| default | 4 |"]
@@ -464,13 +447,13 @@ def test_scenery_is_light_of_the_same_frame_and_not_the_scene_itself(name: str) 
 @pytest.mark.parametrize("name", ["tiff", "jpeg"])
 def test_other_kinds_of_photos_show_what_raw_ones_do(tmp_path: Path, name: Literal["tiff", "jpeg"]) -> None:
     files = photographs(tmp_path, 4)
-    one = Case(1006, (1,), 32, 64, layout_for(files, (32, 64)))
+    one = Case(1006, (1,), 32, 64, cases.layout_for(files, (32, 64)))
     folder = tmp_path / "photos"
     folder.mkdir()
-    scene = centred_cut(frame_scene(files, one.layout, None), 32, 64)
+    scene = cases.centred_cut(cases.frame_scene(files, one.layout, None), 32, 64)
     photo = photograph(scene, one.lens, one.settings, one.camera, np.random.default_rng(0))
     write_photo(folder / "photo.dng", photo)
-    seen = develop(in_container(folder / "photo.dng", name))
+    seen = develop(cases.in_container(folder / "photo.dng", name))
     assert seen.info.kind == name
     assert seen.info.metadata.aperture == pytest.approx(one.settings.aperture, abs=0.01)
     gains = np.asarray(one.camera.white_balance, dtype=np.float32)[:, None, None]
@@ -511,10 +494,10 @@ def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Photos and truth are made up, so that only the order of work is under test."""
     taken: list[str] = []
 
-    def made_up(one: Case, files: Sequence[Path], folder: Path, **_: object) -> Shots:
+    def made_up(one: Case, files: Sequence[Path], folder: Path, **_: object) -> cases.Shots:
         taken.append(one.name)
         folder.mkdir(parents=True, exist_ok=True)
-        return Shots.of(one, folder)
+        return cases.Shots.of(one, folder)
 
     truth = {"states": {BEFORE: state(100, 30.0), TRUE: state(200, 34.0)}}
     monkeypatch.setattr(job, "take", made_up)

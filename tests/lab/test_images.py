@@ -16,11 +16,8 @@ from lab.scenes import dead_leaves
 from lensmodel.core.types import CORNER_ZONE_R, FieldPosition, Frame
 
 
-def test_psnr_is_that_of_the_mean_square() -> None:
+def test_psnr_and_the_curve_of_srgb_have_their_known_values() -> None:
     assert psnr_of(0.1**2) == pytest.approx(20.0)
-
-
-def test_srgb_curve_has_its_known_values_and_clips() -> None:
     np.testing.assert_allclose(
         to_srgb(np.array([-1.0, 0.0, 0.0031308, 0.214041, 1.0, 2.0])), [0, 0, 0.04045, 0.5, 1, 1], atol=1e-4
     )

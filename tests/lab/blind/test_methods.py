@@ -68,8 +68,6 @@ def test_the_kernel_turns_with_the_patch(method: BlindMethod, patch: Plane, foun
     assert distance(turned.kernel, np.rot90(found)).ncc > 0.95
 
 
-# ---- camera shake is what these methods were made for: each must recover Levin's measured kernels
-
 SHAKEN_SIGMA = 0.003
 SHARP = ("s08_spices", "s19_white_roses")
 

@@ -4,18 +4,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from lab.blind.steps.pyramid import (
-    RATIO,
-    Image,
-    Level,
-    View,
-    coarse_to_fine,
-    kernel_sides,
-    noise_gain,
-    odd,
-    resample,
-    rescaled,
-)
+from lab.blind.steps import pyramid
+from lab.blind.steps.pyramid import RATIO, Image, Level, View, coarse_to_fine, odd, resample, rescaled
 from lab.kernels import gaussian
 from lensmodel.core.psf import centroid, second_moments
 from lensmodel.core.types import Kernel, NoiseModel
@@ -45,7 +35,9 @@ def test_stripes_finer_than_the_coarse_grid_do_not_alias() -> None:
 def test_noise_gain_is_what_white_noise_keeps() -> None:
     white = np.random.default_rng(1).normal(size=(300, 300))
 
-    assert resample(white, (212, 212)).std() == pytest.approx(noise_gain((300, 300), (212, 212)), rel=0.02)
+    assert resample(white, (212, 212)).std() == pytest.approx(
+        pyramid.noise_gain((300, 300), (212, 212)), rel=0.02
+    )
 
 
 def test_affine_change_of_values_changes_no_view() -> None:
@@ -79,7 +71,7 @@ def test_every_level_gets_shapes_that_fit_together() -> None:
 
     found = coarse_to_fine(View(picture(96, 80), 0.01), look, 15, start=gaussian(15, np.eye(2)))
 
-    sides = kernel_sides(15, 80)
+    sides = pyramid.kernel_sides(15, 80)
     assert sides == tuple(odd(15 * RATIO**i) for i in range(len(sides)))
     assert sides[-1] >= 5 > odd(15 * RATIO ** len(sides))
     assert [level.side for level in levels] == [*reversed(sides)]

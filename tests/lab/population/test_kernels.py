@@ -4,17 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
-from lab.population.kernels import (
-    COLUMNS,
-    TERMS,
-    Renderer,
-    basis,
-    behind_sensor,
-    kernels_of,
-    scaled,
-    spots,
-    stopped_down,
-)
+from lab.population import kernels
+from lab.population.kernels import TERMS, Renderer, basis, behind_sensor, kernels_of, scaled, spots
 from lab.population.wavefronts import RandomLens
 from lensmodel.neural.network import SIDE
 
@@ -23,14 +14,14 @@ AT = np.arange(SIDE) - SIDE // 2
 
 
 def one_term(n: int, m: int, value: float, *, sine: bool = False) -> np.ndarray:
-    coefficients = np.zeros(COLUMNS)
+    coefficients = np.zeros(kernels.COLUMNS)
     coefficients[2 * TERMS.index((n, m)) + sine] = value
     return coefficients
 
 
 def test_a_perfect_lens_gives_airys_disc_on_pixels() -> None:
     f_number, pitch, wavelength = 8.0, 2.0, 0.55
-    kernel = Renderer(f_number, pitch).kernel(np.zeros(COLUMNS), OPEN, wavelength)
+    kernel = Renderer(f_number, pitch).kernel(np.zeros(kernels.COLUMNS), OPEN, wavelength)
     points = np.arange(-11 * SIDE // 2 + 1, 11 * SIDE // 2 + 1) / 11 * pitch
     radius = np.hypot(points[:, None], points[None]) * np.pi / (wavelength * f_number) + 1e-9
     airy = ((2 * j1(radius) / radius) ** 2).reshape(SIDE, 11, SIDE, 11).sum((1, 3))
@@ -60,8 +51,8 @@ def test_width_of_strong_defocus_is_that_of_its_rays() -> None:
 
 def test_stopping_down_keeps_the_wavefront_of_the_inner_pupil() -> None:
     rng = np.random.default_rng(4)
-    coefficients = rng.normal(size=COLUMNS)
-    inner = coefficients @ stopped_down(0.6)
+    coefficients = rng.normal(size=kernels.COLUMNS)
+    inner = coefficients @ kernels.stopped_down(0.6)
     angle, radius = rng.uniform(0, 6.28, 50), np.sqrt(rng.uniform(0, 0.9, 50))
     x, y = radius * np.cos(angle), radius * np.sin(angle)
     difference = coefficients @ basis(0.6 * x, 0.6 * y) - inner @ basis(x, y)
@@ -73,12 +64,12 @@ def test_stopping_down_keeps_the_wavefront_of_the_inner_pupil() -> None:
 @pytest.mark.parametrize("family", ["wavefront", "third-order"])
 def test_a_drawn_lens_has_centred_kernels_and_is_the_same_again(family: str) -> None:
     xy = np.array([[0.001, 0.0005], [0.5, 0.2], [-0.7, 0.5]])
-    kernels = kernels_of(RandomLens(np.random.default_rng(5), family), xy)  # type: ignore[arg-type]
+    drawn = kernels_of(RandomLens(np.random.default_rng(5), family), xy)  # type: ignore[arg-type]
     again = kernels_of(RandomLens(np.random.default_rng(5), family), xy)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(kernels, again)
-    assert (kernels >= 0).all()
-    np.testing.assert_allclose(kernels.sum((-1, -2)), 1.0, atol=1e-5)
-    assert np.abs(kernels.sum(-2) @ AT).max() < 0.1
+    np.testing.assert_array_equal(drawn, again)
+    assert (drawn >= 0).all()
+    np.testing.assert_allclose(drawn.sum((-1, -2)), 1.0, atol=1e-5)
+    assert np.abs(drawn.sum(-2) @ AT).max() < 0.1
 
 
 @pytest.mark.parametrize(("separation", "diffusion"), [(0.8, 0.0), (0.0, 1.3), (0.6, 0.7)])

@@ -10,16 +10,9 @@ import numpy as np
 import pytest
 
 from lab.kernels import distance
-from lab.population import traced
+from lab.population import prescriptions, traced
 from lab.population.kernels import TERMS, Renderer, spots
-from lab.population.prescriptions import (
-    HELD_OUT,
-    LOOKED_AT,
-    PRESCRIPTIONS,
-    Prescription,
-    partial_dispersion,
-    refractive_index,
-)
+from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS, Prescription, refractive_index
 from lab.population.traced import Faults, TracedLens, draw
 from lab.population.tracing import AIM_UM, Nominal
 from lab.traced import _centred, _moved, read_grid
@@ -132,7 +125,7 @@ def test_glasses_have_the_index_of_their_catalogue() -> None:
     assert refractive_index(glasses, waves) == pytest.approx(np.array(published), abs=6e-5)
     # S-FPL51 and S-LAH66 beside them (Ohara): one in the fluorides, one in the lanthanum glasses
     for *glass, ratio in (*glasses, (1.497, 81.54, 0.5375), (1.7725, 49.6, 0.5520)):
-        assert partial_dispersion(*glass) == pytest.approx(ratio, abs=2 * 0.003)
+        assert prescriptions.partial_dispersion(*glass) == pytest.approx(ratio, abs=2 * 0.003)
 
 
 @pytest.mark.parametrize("name", sorted(PRESCRIPTIONS))
@@ -153,7 +146,7 @@ def test_a_design_has_its_published_focal_length_and_a_sharp_image(name: str) ->
 
 def test_what_is_held_out_is_half_and_keeps_patents_whole() -> None:
     assert 0.4 < len(HELD_OUT) / len(PRESCRIPTIONS) < 0.6
-    assert not HELD_OUT & LOOKED_AT
+    assert not HELD_OUT & prescriptions.LOOKED_AT
     assert {"telephoto", "field-corrector", "aspheric", "noct"} <= HELD_OUT
     unseen = {PRESCRIPTIONS[name].family for name in HELD_OUT}
     assert not unseen & {one.family for name, one in PRESCRIPTIONS.items() if name not in HELD_OUT}

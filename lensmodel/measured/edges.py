@@ -94,13 +94,7 @@ class SlantedEdges(Measurer):
 
 
 def chart_edges(photo: LinearPhoto) -> tuple[FoundEdge, ...]:
-    """Find the edges of a photographed chart in its green plane.
-
-    Raises
-    ------
-    NotEnoughEvidenceError
-        If there are fewer than a chart has.
-    """
+    """Find the edges of a photographed chart in its green plane; refuse one that shows none."""
     edges = find_edges(photo.planes[1], noise=photo.noise[1], clip=photo.clip[1])
     if not edges:
         raise NotEnoughEvidenceError(

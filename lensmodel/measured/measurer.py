@@ -101,25 +101,10 @@ class Measurer(ABC):
         channels: Sequence[Channel] = CHANNELS,
         on_step: StepHook = ignore_step,
     ) -> list[MeasuredPsf]:
-        """Measure the PSF wherever the photos show it.
+        """Measure the PSF wherever the photos, as many as `photos` says, show it.
 
-        Parameters
-        ----------
-        photos : sequence of LinearPhoto
-            As many as `photos` says; the first is the one whose PSF is measured.
-        size : int
-            Odd side of the kernels in pixels.
-        channels : sequence of {"r", "g", "b"}
-            Colour planes to measure.
-        on_step : StepHook
-            Called after each place, and now and then before the first one, with nothing done of 1.
-
-        Raises
-        ------
-        InvalidInputError
-            If the number of photos is wrong, or they do not fit each other.
-        NotEnoughEvidenceError
-            If they do not show what this way of measuring needs; the text says what is missing.
+        The first is the one whose PSF is measured; kernels have an odd side of `size` pixels. `on_step` is
+        called after each place, and now and then before the first one, with nothing done of 1.
         """
         if len(photos) != self.photos:
             raise InvalidInputError(

@@ -10,13 +10,8 @@ checkerboard, s = (1/2, 1/2), red and blue on every second row and column. With 
 the part of it that is no picture has about  a sum_s S(f - s),  and a kernel is drawn towards nothing there as
 far as that outweighs the data; else it comes out with a checkerboard of its own.
 
-Closed lenses are not perfect. What they blur besides diffraction is missing in k, and `FLOOR` says how
-much that is as a rule.
-
-Where a scene has detail everywhere, as one for an aperture pair should, no flat place shows the noise, and
-detail passes for noise: behind leaves and grain five times as much is estimated, which doubles the error of
-kernels. Noise is also in the finest detail of the quietest place, with whatever scene is there: the power
-there is an upper bound; a photo taken wide open, whose lens took the finest detail away, comes close to it.
+Where a scene has detail everywhere no flat place shows the noise, and five times as much would be estimated:
+the power of the finest detail in the quietest place is an upper bound of it.
 """
 
 from __future__ import annotations

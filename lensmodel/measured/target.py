@@ -7,10 +7,9 @@
    tones: light = E(p) * (t1 R + t2 R² + t3 R³), where R is the page's reflectance.
 4. The kernel between that picture and the pixels that were measured: `solve`.
 
-Light and detail of a window are told apart with the kernel in mind. The mean of noise over a part of a window
-is not quite that of the page: a quadratic fitted to the photo alone follows the slow waves of the noise
-itself, and a hundredth of wrong light over a window becomes a tenth of wrong kernel in its wings. What is
-printed is known, so with a kernel k that is nearly right
+A quadratic fitted to the light of a window alone would follow the slow waves of the noise itself, and a
+hundredth of wrong light becomes a tenth of wrong kernel. What is printed is known, so with a kernel k that is
+nearly right
 
     y(p) = sum_j e_j (k * (q_j R))(p) + sum_j c_j q_j(p) + n(p)
 

@@ -28,10 +28,6 @@ resampled once, at the pixels q of an answer (`spline_sums`)::
 
     f(q) = sum_i w_i |M_i| S_i(M_i (q - shift)),    S(p) = sum_k c_k B3(p_r - k_r) B3(p_c - k_c)
 
-The finer grid is filled by a spline of degree 7: a cubic one of the pixels would be off by 0.7 percent of the
-peak where a Gaussian of 1.1 px is turned by 45 degrees. Kernels so narrow that their spectrum reaches the
-Nyquist frequency ripple between the pixels with a high degree, and are filled with the cubic one.
-
 Source: M. Unser, "Splines: a perfect fit for signal and image processing", IEEE Signal Processing Magazine
 16, 1999.
 """
@@ -275,7 +271,8 @@ def _log_widths(sample: PsfSample) -> tuple[float, float]:
 FINER = 2  # coefficients for each pixel along an axis; 1 where memory is short
 _MOST_BYTES = 1 << 29  # beyond, kernels are kept no finer than their pixels
 
-# Degrees: near the band limit where light is smooth, short where it is narrow (chosen)
+# Degrees of the spline that fills the finer grid (chosen): a cubic one would be off by .7 % of the peak of a
+# Gaussian of 1.1 px turned by 45 degrees; kernels up to the Nyquist frequency ripple with a high one
 _SMOOTH, _NARROW = 7, 3
 _ALIASED = (0.05, 0.2)  # contrast at the Nyquist frequency: below, above
 _MARGIN = 8  # pixels: the spline's response has fallen to 3e-5 there

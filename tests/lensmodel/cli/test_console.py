@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -105,18 +104,3 @@ def test_commands_of_the_service_and_the_list_of_commands_do_not_wait_for_scipy(
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
 
     assert not {"scipy", "skimage", "lensmodel.model", "sqlalchemy"} & set(done.stdout.split())
-
-
-def test_one_command_installs_the_completion_of_a_shell(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "lensmodel", "--install-completion", "bash"],
-        env={**os.environ, "HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-    assert done.returncode == 0, done.stderr
-    (script,) = (tmp_path / ".bash_completions").iterdir()
-    assert script.name == "lensmodel.sh"
-    assert "_LENSMODEL_COMPLETE" in script.read_text()

@@ -19,7 +19,7 @@ from lensmodel.cli.report import name_of
 from lensmodel.core.files import from_json
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.model import LensModel, LensProfile, save_profile
 from lensmodel.report import LensReport, lens_report, provenance
 
 NAME = "my-24mm.lensprofile"
@@ -141,15 +141,3 @@ def test_what_cannot_be_written_is_refused_before_anything_is(
     assert isinstance(refused.exception, UsageError)
     assert "--force" not in str(refused.exception)
     assert [p.name for p in folder.iterdir()] == [NAME]
-
-
-def test_an_exported_stack_holds_the_answers_of_the_profile(folder: Path) -> None:
-    run("export", NAME, "-o", "psf.npz", "--rows", "2", "--cols", "3", "--size", "15", "--aperture", "2")
-
-    pages = np.load(folder / "psf.npz")["psf"]
-    model = load_profile(folder / NAME).model
-    width, height = 1.5 / math.hypot(1.5, 1.0), 1.0 / math.hypot(1.5, 1.0)
-    x, y = -2.0 / 3.0 * width, 0.5 * height
-    first = model.query(FieldPosition(math.hypot(x, y), math.atan2(y, x)), LensSettings(aperture=2.0), 15)
-    assert pages.shape == (6, 15, 15)
-    assert pages[0] == pytest.approx(first.kernel, abs=1e-7)

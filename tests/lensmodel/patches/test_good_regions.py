@@ -77,15 +77,6 @@ def test_trees_are_evaluated_as_written_down() -> None:
     np.testing.assert_allclose(ensemble.predict(rows), [11.5, 12.5, 14.5])
 
 
-def test_score_falls_as_the_predicted_error_grows(windows_and_details: tuple[Windows, Details]) -> None:
-    windows, details = windows_and_details
-    score = GoodRegionsSelector().score(windows, details)
-    predicted = TreeEnsemble.load().predict(features_of(windows, details))
-
-    assert np.all((score > 0.0) & (score < 1.0))
-    assert np.all(np.diff(score[np.argsort(predicted)]) <= 0.0)
-
-
 def test_a_window_with_detail_scores_above_the_same_window_in_heavy_noise() -> None:
     windows, details = looked_at(plane_of(3))
     noisy = dataclasses.replace(details, information=details.information - np.log(100.0))

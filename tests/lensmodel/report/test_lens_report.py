@@ -367,16 +367,6 @@ def test_rings_lie_on_the_picture_and_balance(r: float, aspect: float) -> None:
     assert sum(math.sin(p.phi) for p in found) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_grids_run_row_by_row_from_the_top_left() -> None:
-    found = grid(3, 5, 1.5)
-
-    assert len(found) == 15
-    assert found[0].phi > math.pi / 2
-    assert 0 < found[4].phi < math.pi / 2
-    assert found[7].r == pytest.approx(0.0)
-    assert -math.pi < found[10].phi < -math.pi / 2
-
-
 @pytest.mark.parametrize("make", [lambda: grid(0, 3, 1.5), lambda: ring(0.5, 1, 9.0)])
 def test_places_out_of_range_are_refused(make: object) -> None:
     with pytest.raises(InvalidInputError):

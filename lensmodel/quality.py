@@ -2,7 +2,7 @@
 
 Steps, for an edge that crosses the rows; others are turned first:
 
-1. signed derivative of every row, Hamming window on the edge, centroid;
+1. signed derivative of every row (of |d| noise would pull the line), Hamming window on the edge, centroid;
 2. straight line through the centroids, second pass with windows that follow the line;
 3. distance of every pixel to the edge along its normal, t = (x - c(row)) cos(theta);
 4. mean in bins of 1/4 pixel: the edge spread function, oversampled 4 times;
@@ -10,18 +10,13 @@ Steps, for an edge that crosses the rows; others are turned first:
 6. division by the response of the difference, sin(2 pi f / 4) / (2 pi f / 4), and of the bins,
    sin(pi f / 4) / (pi f / 4).
 
-The derivative keeps its sign: with |d| noise pulls every centroid to the middle of its window, the
-line is fitted wrong, and at 1 percent noise MTF50 falls from 0.324 to 0.228 for a sharp edge.
+Edges are found in means of 4 x 4 pixels: runs of windows whose structure tensor J says that all gradients
+point one way, and not along the grid, coherence = sqrt((Jxx - Jyy)² + 4 Jxy²) / (Jxx + Jyy), and whose
+gradients lie on one line; then, strongest first, in the middle of each run at full size: unclipped, flat on
+both sides, and explained by its own edge profile to a few percent of the step.
 
-Edges are found first on a grid, in means of 4 x 4 pixels: windows whose structure tensor J says that all
-gradients point one way, and not along the grid, coherence = sqrt((Jxx - Jyy)² + 4 Jxy²) / (Jxx + Jyy), and
-whose gradients lie on one line. Such windows form runs, one along each edge. Then, strongest first, in the
-middle of each run at full size: unclipped, flat on both sides, and explained by its own edge profile to a few
-percent of the step. Photos of anything but a chart hardly ever have such windows.
-
-Sources: ISO 12233:2017, annex D; P. D. Burns, "Slanted-edge MTF for digital camera and scanner
-analysis", IS&T PICS 2000; J. Bigun, G. H. Granlund, "Optimal orientation detection of linear symmetry",
-ICCV 1987.
+Sources: ISO 12233:2017, annex D; P. D. Burns, "Slanted-edge MTF for digital camera and scanner analysis",
+IS&T PICS 2000; J. Bigun, G. H. Granlund, "Optimal orientation detection of linear symmetry", ICCV 1987.
 """
 
 from __future__ import annotations

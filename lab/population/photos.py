@@ -27,7 +27,7 @@ from lab.population.scenes import busiest
 from lensmodel.core.psf import PatchKind
 from lensmodel.neural.network import FINE, SIDE
 from lensmodel.neural.statistics import LENGTH, WINDOW, patch_statistics
-from lensmodel.simulate import srgb_to_linear
+from lensmodel.photo.colour import srgb_to_linear
 
 _MARGIN: Final = 8  # pixels around a window that demosaicking and sharpening look at
 _CLIPPED: Final = 0.02  # largest share of clipped samples of a patch that is used
@@ -121,11 +121,11 @@ class Processing:
         luma = self._sharpened(luma)
         v = np.clip(luma + chroma, 0.0, 1.0)
         if not self.quality:
-            return srgb_to_linear(v)
+            return srgb_to_linear(v).astype(np.float32)
         data, eight = io.BytesIO(), (v.transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8)
         Image.fromarray(eight).save(data, "JPEG", quality=self.quality, subsampling="4:2:0")
         with Image.open(data) as picture:
-            return srgb_to_linear(np.asarray(picture, np.float32).transpose(2, 0, 1) / 255.0)
+            return srgb_to_linear(np.asarray(picture).transpose(2, 0, 1) / 255.0).astype(np.float32)
 
 
 _LUMA: Final = np.array([0.299, 0.587, 0.114], np.float32)

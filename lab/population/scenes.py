@@ -21,7 +21,7 @@ from PIL import Image
 
 from lab.scenes import dead_leaves, text
 from lensmodel.core.files import write_atomically
-from lensmodel.simulate import srgb_to_linear
+from lensmodel.photo.colour import srgb_to_linear
 
 Scene = NDArray[np.float16]  # (height, width, 3), linear light, white 1
 
@@ -83,7 +83,7 @@ def objects_of(repository: Path, under: str) -> Iterator[Source]:
 def linear(data: bytes) -> NDArray[np.float32]:
     """Decode a picture to linear light (sRGB), float32 of shape (height, width, 3)."""
     with Image.open(io.BytesIO(data)) as picture:
-        return srgb_to_linear(np.asarray(picture.convert("RGB"), np.float32) / 255.0)
+        return srgb_to_linear(np.asarray(picture.convert("RGB")) / 255.0).astype(np.float32)
 
 
 def scaled_down(scene: NDArray[np.float32], factor: float) -> NDArray[np.float32]:

@@ -1,8 +1,6 @@
 """The default: patches of a whole photo, encoded beside each other by the network of `lensmodel.neural`.
 
-photo -> windows all over it -> statistics -> tokens, by attention within the photo -> a kernel of each
-
-Kernels of single patches are to be looked at, exported, and averaged by the paper's regression. The model
+Kernels of single patches are to be looked at, exported, and averaged by the paper's regression; the model
 attends to the tokens themselves (`lensmodel.model.learned_field`).
 """
 

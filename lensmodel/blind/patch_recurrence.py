@@ -1,17 +1,11 @@
 """Blind deblurring by internal patch recurrence, `michaeli-irani`: the paper's estimator.
 
-In a sharp picture small patches recur unchanged in a smaller copy of it; blur breaks that, and the
-smaller copy is sharper in its own pixels. Its patches are examples of what the sharp picture looks
-like. Source: T. Michaeli and M. Irani, "Blind deblurring using internal patch recurrence",
-ECCV 2014, section 3.
+In a sharp picture small patches recur unchanged in a smaller copy of it; blur breaks that, and the patches of
+the smaller copy are examples of what the sharp picture looks like. Source: T. Michaeli and M. Irani, "Blind
+deblurring using internal patch recurrence", ECCV 2014, section 3.
 
 One addition, without which the method collapses on photos in linear light: the noise of y is in the latent
-image too, so the normal equations of the kernel step get a spike that pulls k to a delta (errors in
-variables). Its expectation is known and taken off.
-
-These equations are sums over pixels p of x(p + a) x(p + b), for all offsets a and b in the kernel's square.
-Sums that differ by a shift of both offsets share all rows but a few at their ends, so that the work grows
-with the third power of the side and not with the fourth, see `window_products`.
+image too (errors in variables), and its known expectation is taken off the normal equations of the kernel.
 """
 
 from __future__ import annotations
@@ -241,17 +235,16 @@ class PatchRecurrence:
 
     def _step(self, views: Sequence[_Scaled], latent: list[Image], kernel: Kernel, side: int) -> Kernel:
         """Match and sharpen each latent image, in place, and solve for the kernel that they share."""
-        a, b, taken = np.zeros((side**2, side**2)), np.zeros(side**2), 0.0
+        a, b = np.zeros((side**2, side**2)), np.zeros(side**2)
         for i, view in enumerate(views):
             z = recur(latent[i], view.noise, max(self.bandwidth, 2.0 * view.noise))
             latent[i], response = blend(view.y, kernel, z, self.beta)
-            own_a, own_b, own_taken = normal_equations(latent[i], view.y, side, view.noise, response)
+            own_a, own_b = normal_equations(latent[i], view.y, side, view.noise, response)
             weight = 1.0 / max(view.noise**2, 1e-6)
-            a, b, taken = a + weight * own_a, b + weight * own_b, taken + weight * own_taken
-        ridge = self.ridge * np.trace(a) / a.shape[0]
-        a[np.diag_indices_from(a)] += ridge
+            a, b = a + weight * own_a, b + weight * own_b
+        a[np.diag_indices_from(a)] += self.ridge * np.trace(a) / a.shape[0]
         begin = np.asarray(resized(kernel, side)).ravel()
-        solved = nonnegative_least_squares(a, b, begin, smallest=ridge - taken)
+        solved = nonnegative_least_squares(a, b, begin)
         solved[solved < 0.01 * solved.max()] = 0.0
         if not solved.max() > 0:
             raise NotEnoughEvidenceError("the kernel vanished; the patches hold no detail beyond the noise")
@@ -260,15 +253,13 @@ class PatchRecurrence:
 
 def normal_equations(
     x: Image, y: Image, side: int, noise: float, response: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations of y = k * x over the interior, the noise that x took from y taken off.
 
     With h the filter by which y entered x (origin at [0, 0]), s the noise of y and N interior pixels::
 
         A(u, v) = sum_p x(p - u) x(p - v) - N s² sum_i h(i) h(i + u - v)
         b(u)    = sum_p y(p) x(p - u)     - N s² h(-u)
-
-    Returns A, b, and N s² max |H|², which the largest eigenvalue of what was taken off A does not exceed.
     """
     half = side // 2
     margin = _BORDER
@@ -278,15 +269,14 @@ def normal_equations(
     n = target.size
     gram, cross = window_products(inner, target, side)
     a, b = gram[::-1, ::-1].copy(), cross[::-1].copy()
-    power = np.abs(fft.rfft2(response)) ** 2
-    acf = n * noise**2 * fft.irfft2(power, s=response.shape)
+    acf = n * noise**2 * fft.irfft2(np.abs(fft.rfft2(response)) ** 2, s=response.shape)
     lags = np.arange(1 - side, side)
     # [i, j, k, l] is acf(i - k, j - l): windows of all lags, the second offset counted backwards
     apart = sliding_window_view(acf[np.ix_(lags, lags)], (side, side))[:, :, ::-1, ::-1]
     a.reshape((side,) * 4)[...] -= apart
     offsets = half - np.arange(side)
     b -= n * noise**2 * response[np.ix_(offsets, offsets)].ravel()
-    return a, b, n * noise**2 * float(power.max())
+    return a, b
 
 
 def _odd(value: float) -> int:

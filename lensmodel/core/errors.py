@@ -1,8 +1,8 @@
-"""What can go wrong: every text names the offending value and the remedy.
+"""What can go wrong: every text names the offending value and the remedy, `code` is the word for programs.
 
-`code` is the fixed word by which programs tell the cases apart. The caller can mend an `InvalidInputError`
-(HTTP 422); the photo is to blame for an `UnreadablePhotoError` (415), an `ImageTooLargeError` (413) and a
-`MetadataMissingError` (422); of a `NotEnoughEvidenceError` (409) more photos may help.
+The caller can mend an `InvalidInputError` (HTTP 422); the photo is to blame for an `UnreadablePhotoError`
+(415), an `ImageTooLargeError` (413), a `MetadataMissingError` (422); more photos may help a
+`NotEnoughEvidenceError` (409).
 """
 
 from __future__ import annotations

@@ -48,11 +48,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def save_array(file: BinaryIO, array: NDArray[Any]) -> None:
-    """Write an array of one axis or more and a plain dtype in NumPy's own format.
-
-    `numpy.save` writes to files by a C function and forgets why it failed: that a disk is full would pass
-    for a fault of the program.
-    """
+    """Write an array of a plain dtype as `numpy.save` does, which forgets that a disk was full."""
     whole = np.ascontiguousarray(array)
     np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(whole))
     file.write(whole.reshape(-1).view(np.uint8).data)

@@ -33,17 +33,11 @@ def nonnegative_least_squares(
     b: NDArray[np.float64],
     start: NDArray[np.float64],
     steps: int = 200,
-    *,
-    smallest: float = -np.inf,
 ) -> NDArray[np.float64]:
-    """Minimise k'Ak/2 - b'k over k >= 0 by accelerated projected gradients (FISTA).
-
-    `scipy.optimize` (`nnls`, `lsq_linear`) takes the residuals' matrix, of millions of rows; here only its
-    normal equations are known.
-    """
+    """Minimise k'Ak/2 - b'k over k >= 0 by FISTA; scipy's `nnls` wants the matrix of residuals."""
     if not a.any():
         return start.copy()
-    largest, lift = _largest_and_lift(a, smallest)
+    largest, lift = _largest_and_lift(a)
     return fista(
         lambda k: _product(a, k) + lift * k - b,
         start,
@@ -79,19 +73,16 @@ def fista(
     return k
 
 
-def _largest_and_lift(a: NDArray[np.float64], smallest: float) -> tuple[float, float]:
+def _largest_and_lift(a: NDArray[np.float64]) -> tuple[float, float]:
     """Largest eigenvalue, and what all are lifted by so that none is below `_LEAST` of that."""
     # all eigenvalues take ten times as long as a Cholesky factor, which tells of small ones
     if len(a) > _FEW:
         start = np.ones(len(a))
         largest = float(scipy.sparse.linalg.eigsh(a, 1, v0=start, return_eigenvectors=False)[0])
-        least = _LEAST * largest
-        if largest > 0.0:
-            if smallest > least:
-                return largest, 0.0
-            with contextlib.suppress(np.linalg.LinAlgError):
-                scipy.linalg.cholesky(a - least * np.eye(len(a)), overwrite_a=True, check_finite=False)
-                return largest, 0.0
+        with contextlib.suppress(np.linalg.LinAlgError):
+            least = _LEAST * largest * np.eye(len(a))
+            scipy.linalg.cholesky(a - least, overwrite_a=True, check_finite=False)
+            return largest, 0.0
     eigenvalues = np.linalg.eigvalsh(a)
     largest = float(eigenvalues[-1])
     return largest, max(_LEAST * largest - float(eigenvalues[0]), 0.0)

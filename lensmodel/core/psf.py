@@ -63,10 +63,7 @@ def centroid(kernel: npt.NDArray[np.float64]) -> tuple[float, float]:
 
 
 def centred(kernel: npt.ArrayLike) -> Kernel:
-    """Shift the centre of mass onto the middle pixel.
-
-    Whole pixels are moved first, and what leaves the array is lost; the rest is a cubic-spline shift.
-    """
+    """Shift the centre of mass onto the middle pixel: by whole pixels first, the rest by cubic splines."""
     current = np.array(as_kernel(kernel))
     for _ in range(12):  # clipping the spline's undershoot moves the centre a little
         row, col = centroid(current)
@@ -108,10 +105,7 @@ def otf(kernel: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDArray[
 
 
 def whole_peak(cross: npt.NDArray[np.complex128]) -> tuple[int, int]:
-    """Whole pixels `(row, col)` by which the first of two square arrays lies beyond the other.
-
-    `cross` is their cross spectrum A conj(B), of the full FFT.
-    """
+    """Whole pixels `(row, col)` by which A lies beyond B, from their cross spectrum A conj(B)."""
     n, surface = len(cross), scipy.fft.ifft2(cross).real
     row, col = (np.array(np.unravel_index(surface.argmax(), surface.shape)) + n // 2) % n - n // 2
     return int(row), int(col)
@@ -122,9 +116,7 @@ def correlation_peak(
 ) -> tuple[tuple[float, float], float]:
     """Shift `(row, col)` near whole pixels at which a correlation peaks, and its value there.
 
-    It is found by Newton steps on the Fourier series::
-
-        c(d) = 1/n² sum_f cross(f) exp(2 pi i f d)
+    By Newton steps on the Fourier series c(d) = 1/n² sum_f cross(f) exp(2 pi i f d).
     """
     n, d = len(cross), np.array(near, dtype=np.float64)
     freq = 2.0 * np.pi * scipy.fft.fftfreq(n)

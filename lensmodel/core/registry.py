@@ -18,15 +18,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Named factories of one kind, those of installed packages included.
-
-    `group` names their entry points; these are loaded when they are first asked for, and never replace an
-    entry that is there. `register` adds to it for this process.
-    """
+    """Named factories of one kind, and those of installed packages: loaded when first asked for."""
 
     kind: str  # what the entries are, for error messages
     entries: Mapping[str, Callable[..., T]]  # by name; each returns an entry from keyword parameters
-    group: str = ""
+    group: str = ""  # of the entry points of installed packages; they never replace an entry
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "entries", dict(self.entries))  # our own, never the caller's

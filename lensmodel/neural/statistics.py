@@ -2,13 +2,11 @@
 
 They are, for the samples of each colour in the mosaic, the logarithm of the noise-corrected power spectrum in
 rings and directions, and for interpolated green how the gradient across edges correlates with itself along
-eight directions. The correlation of its third and seventh power with itself belongs to the strongest edges,
-is signed (a halo is negative) and differs between the two sides of an edge where the PSF is one-sided
-(coma).
+eight directions: its third and seventh powers belong to the strongest edges, are signed (a halo is negative)
+and differ between the two sides of an edge where the PSF is one-sided (coma).
 
-A pixel grid looks the same after a quarter turn or in a mirror, so that every place is turned into the octant
-0 <= y <= x first. An octant is a triple of flags: mirror x, then mirror y, then exchange x and y. Places have
-x to the right and y upwards; arrays have rows downwards.
+Every place is turned into the octant 0 <= y <= x. An octant is a triple of flags: mirror x, then mirror y,
+then exchange x and y. Places have x to the right and y upwards; arrays have rows downwards.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""Transfer curves and colour matrices: file numbers to linear light and back.
+"""Transfer curves, colour matrices and ICC profiles: file numbers to linear light and back.
 
-Profiles are read and made by LittleCMS, but for one with primaries that no chromaticities give.
 Sources: IEC 61966-2-1:1999 (sRGB); ICC.1:2022.
 """
 

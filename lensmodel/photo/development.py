@@ -1,7 +1,6 @@
 """From a photo file, or an array, to linear light; and what is known of a file without decoding it.
 
-RAW goes through LibRaw, as linear camera colours with the true saturation level at 1; TIFF, PNG and JPEG are
-decoded to numbers in full precision, and these to light by their transfer curve.
+RAW goes through LibRaw; TIFF, PNG and JPEG are decoded to numbers, and these to light by their curve.
 """
 
 from __future__ import annotations

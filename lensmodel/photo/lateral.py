@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage, optimize
+from scipy import fft, ndimage
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import correlation_peak, whole_peak
@@ -69,11 +69,9 @@ class LateralColour:
 def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[float] = 1.0) -> LateralColour:
     """Estimate lateral colour from corners and edges of the photo.
 
-    In each of 10 x 10 cells up to five points with structure in both directions are taken from
-    green. Around each, the shift of red and blue is where the normalised cross-correlation of
-    band-passed windows peaks, found to sub-pixels by Newton steps on the cross spectrum. The radial
-    part of the shifts is fitted by Huber-weighted least squares; the number of terms, none
-    included, is chosen by the Bayesian information criterion.
+    Around points of green with structure in both directions the shift of red and blue is where the
+    normalised cross-correlation of band-passed windows peaks. The radial part of the shifts is fitted by
+    Huber-weighted least squares; the Bayesian information criterion chooses the number of terms, or none.
     """
     full = 0.98 * np.broadcast_to(clip, 3)
     radii: dict[int, list[float]] = {0: [], 2: []}
@@ -161,13 +159,10 @@ def _banded(window: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _shift(moved: NDArray[np.float64], reference: NDArray[np.float64]) -> tuple[float, float] | None:
-    """Shift `(row, col)` of `moved` against `reference`; None where they do not look alike.
-
-    The second window follows the whole-pixel shift, so that the taper cuts both the same.
-    """
+    """Shift `(row, col)` of `moved` against `reference`; None where they do not look alike."""
     inner = slice(_SEARCH, _SEARCH + _WINDOW)
     still, whole = fft.fft2(tapered := reference[inner, inner] * _TAPER), (0, 0)
-    for tries_left in (2, 1, 0):
+    for tries_left in (2, 1, 0):  # the window follows the whole-pixel shift: the taper cuts both the same
         rows, cols = (slice(_SEARCH + step, _SEARCH + step + _WINDOW) for step in whole)
         cut = moved[rows, cols] * _TAPER
         cross = fft.fft2(cut) * np.conj(still)
@@ -190,8 +185,7 @@ def _fit(r: NDArray[np.float64], shift: NDArray[np.float64], half_diagonal: floa
         return IDENTITY
     best, best_score = np.zeros(0), np.inf
     for terms in range(4):
-        columns = half_diagonal * np.stack([r ** (i + 1) for i in range(terms)], axis=1) if terms else None
-        solution, cost = _huber(columns, shift)
+        solution, cost = _huber(half_diagonal * r[:, None] ** np.arange(1, terms + 1), shift)
         score = r.size * math.log(cost) + (terms + 1) * math.log(r.size)
         if score < best_score:
             best, best_score = solution, score
@@ -199,22 +193,17 @@ def _fit(r: NDArray[np.float64], shift: NDArray[np.float64], half_diagonal: floa
     return (0.0, b, c, 1.0 + v)
 
 
-def _huber(
-    columns: NDArray[np.float64] | None, shift: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+def _huber(columns: NDArray[np.float64], shift: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Iteratively reweighted least squares; returns the terms and the mean robust cost."""
-    solution: NDArray[np.float64] = np.zeros(0)
-    residual: NDArray[np.float64] = shift
+    solution: NDArray[np.float64] = np.zeros(columns.shape[1])
+    residual = shift
     for _ in range(20):
         # The floor keeps perfect data from dividing by zero: shifts are not known below 0.002 px.
         scale = max(1.4826 * float(np.median(np.abs(residual))), 2e-3)
-        weight = np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(residual), 1e-12))
-        if columns is None:
-            break
-        root = np.sqrt(weight)
+        root = np.sqrt(np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(residual), 1e-12)))
+        asked = np.linalg.lstsq(columns * root[:, None], shift * root, rcond=None)[0]
         # few pixels and noise may ask for more than any lens does
-        inside = optimize.lsq_linear(columns * root[:, None], shift * root, bounds=(-_LARGEST, _LARGEST))
-        solution = np.asarray(inside.x, dtype=np.float64)
-        residual = np.asarray(shift - columns @ solution, dtype=np.float64)
+        solution = np.clip(asked, -_LARGEST, _LARGEST, dtype=np.float64)
+        residual = shift - columns @ solution
     size = np.minimum(np.abs(residual), 3.0 * scale)  # gross outliers count once, not squared
     return solution, float(np.mean(size**2)) + 1e-8

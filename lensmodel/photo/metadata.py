@@ -1,13 +1,7 @@
 """What a file says about camera, lens and exposure: read from EXIF, maker note and XMP, written, erased.
 
-The order of trust is EXIF, maker note, XMP. A serial that the camera fills in without knowing
-one is no serial, and an f-number or focal length of zero is unknown: manual lenses say so.
-Maker notes are read only for what EXIF leaves out; one that does not look as expected gives nothing.
-
-The place where a photo was taken is overwritten where it stands: GPS directories become empty ones, values in
-XMP become blanks, no length changes. Read are TIFF structures wherever they lie (TIFF, DNG and RAW files made
-so, the Exif blocks of JPEG files and of previews inside RAW files, PNG, Canon's CR3), and XMP that is not
-compressed.
+The order of trust is EXIF, maker note, XMP. The place where a photo was taken is overwritten where it stands,
+in TIFF structures wherever they lie and in XMP that is not compressed: no length changes.
 
 Sources: CIPA DC-008-2023 (Exif 3.0), section 4.6; ISO 16684-1:2019, sections 7 and 8 (XMP); Adobe, "XMP
 Specification Part 2", 2016 (`aux`); CIPA DC-010-2024 (`exif`, `exifEX`, `tiff`); "Portable Network Graphics,
@@ -76,10 +70,6 @@ _CROP_FACTORS: Final = (0.5, 15.0)  # from medium format to the smallest phones
 
 # What lenses and sensors have, with room on either side.
 _PITCHES_UM: Final = (0.3, 60.0)
-_APERTURES: Final = (0.5, 128.0)
-_FOCALS_MM: Final = (0.1, 20000.0)
-_SPEEDS: Final = (1.0, 1e7)
-_EXPOSURES_S: Final = (1e-7, 1e6)
 
 
 def is_placeholder(serial: str) -> bool:
@@ -139,13 +129,11 @@ class Said:
                 *(xmp.get("aux:SerialNumber"), xmp.get("exifEX:BodySerialNumber")),
             ),
             lens=self._lens(),
-            aperture=_first_within(*_APERTURES, direct, _quotient(xmp.get("exif:FNumber"))),
-            focal_mm=_first_within(*_FOCALS_MM, tags.number(0x920A), _quotient(xmp.get("exif:FocalLength"))),
+            aperture=_first_within(0.5, 128.0, direct, _quotient(xmp.get("exif:FNumber"))),
+            focal_mm=_first_within(0.1, 2e4, tags.number(0x920A), _quotient(xmp.get("exif:FocalLength"))),
             focus_m=self._focus_m(),
-            iso=_first_within(*_SPEEDS, speed, note.iso, _quotient(xmp.get("exif:ISOSpeedRatings"))),
-            exposure_s=_first_within(
-                *_EXPOSURES_S, tags.number(0x829A), _quotient(xmp.get("exif:ExposureTime"))
-            ),
+            iso=_first_within(1.0, 1e7, speed, note.iso, _quotient(xmp.get("exif:ISOSpeedRatings"))),
+            exposure_s=_first_within(1e-7, 1e6, tags.number(0x829A), _quotient(xmp.get("exif:ExposureTime"))),
             taken_at=self._taken_at(),
             orientation=int(turned) if turned is not None and 1 <= turned <= 8 else 1,
             pixel_pitch_um=self._pixel_pitch_um(),

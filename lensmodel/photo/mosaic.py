@@ -1,8 +1,7 @@
 """The numbers of the sensor before demosaicing: whether they are a picture, where they clip, noise, defects.
 
-A hot pixel taken for a point of light teaches a kernel as narrow as itself, and a correction makes a ring
-of it. Light comes through a lens: the pixels beside a point of light get some of it. So a photo shows a
-defect where one pixel stands out of smooth surroundings that get none; in busy places it stays.
+A hot pixel taken for a point of light teaches a kernel as narrow as itself. Light comes through a lens: the
+pixels beside a point of light get some of it, those beside a defect in smooth surroundings none.
 """
 
 from __future__ import annotations
@@ -86,8 +85,7 @@ class Mosaic:
     def _random_share(self) -> float:
         """Share of the bands of rows that have high contrast, but no likeness of neighbouring pixels.
 
-        Independent values differ by 2 / sqrt(pi) = 1.13 standard deviations on average; in
-        photographs of that contrast it is below 0.5. Of X-Trans, greens that touch are compared.
+        Independent values differ by 2 / sqrt(pi) = 1.13 standard deviations on average, photographs by 0.5.
         """
         starts = range(0, len(self.values), _BAND)
         scale = max(self.white - min(self.black), 1.0)
@@ -96,7 +94,7 @@ class Mosaic:
             band = self.values[row : row + _BAND].astype(np.float32)
             if self.is_bayer:
                 deviation, steps = float(band.std()), band[:, 2:] - band[:, :-2]
-            else:
+            else:  # greens that touch
                 colours = self.colours[row : row + _BAND]
                 deviation = float(band[colours == _GREEN].std())
                 steps = np.diff(band, axis=1)[colours[:, 1:] == colours[:, :-1]]
@@ -110,10 +108,9 @@ class Mosaic:
         return replace_defects(self.values, defects(self.values, near), near)
 
     def saturation(self) -> tuple[int, tuple[float, float, float]]:
-        """Level at which the sensor clips, and that of each colour relative to it.
+        """Level at which the sensor clips, and that of each colour relative to it, where clipped pixels pile.
 
-        The level that a file states is often too high, and the colours of some sensors clip at
-        different ones. Where a photo has clipped pixels they pile up, and the pile is the truth.
+        The level that a file states is often too high, and the colours of some sensors differ.
         """
         piles = {k: self._pile(k) for k in range(4) if self.is_bayer or k < 3}
         ends = [pile[1] for pile in piles.values() if pile is not None]

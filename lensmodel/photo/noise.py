@@ -32,12 +32,10 @@ def estimate_noise(
 ) -> NoiseModel:
     """Fit var(y) = shot * y + read to the flat places of a plane of linear light whose noise is white.
 
-    Blocks are sorted by level; of each level the blocks with the least texture count, those near `clip` or
-    black not. Texture is judged on the low-passed plane and noise on the high-passed one, so that the choice
-    does not favour blocks whose noise happens to be small. The variance of a level is a robust one of all
-    its high-passed pixels together, and no less than what rounding makes: by the smallest step between the
-    file's numbers near black, or by the light of each of its `codes`, where they are as few as those of 8
-    bits.
+    Of each level the blocks with the least texture count, those near `clip` or black not. Texture is judged
+    on the low-passed plane and noise on the high-passed one, so that the choice does not favour blocks whose
+    noise happens to be small. A variance is no less than what rounding makes: by the smallest `step` between
+    the file's numbers near black, or by the light of each of its `codes` of 8 bits.
 
     Source: A. Foi, M. Trimeche, V. Katkovnik, K. Egiazarian, "Practical Poissonian-Gaussian noise modeling
     and fitting for single-image raw-data", IEEE TIP 17, 2008.
@@ -50,11 +48,10 @@ def estimate_noise(
 
 
 def coding_noise(coarseness: float, curve: NDArray[np.floating]) -> NoiseModel | None:
-    """Noise that a JPEG's rounding of cosine coefficients makes: a uniform error of step^2 / 12 in each.
+    """Noise that a JPEG's rounding of cosine coefficients makes where detail is: step^2 / 12 in each.
 
-    It is not seen in flat places, where the coefficients are zero before and after, but where detail is.
     The middle one of the steps, `coarseness`, speaks for all: the coarsest are those of frequencies of which
-    a lens leaves little. 0 is no such rounding; `curve` is the light of the codes of 16 bits.
+    a lens leaves little. `curve` is the light of the codes of 16 bits.
     """
     if not coarseness:
         return None
@@ -74,10 +71,9 @@ def grain_of(
 
 
 def graininess(plane: Plane, noise: NoiseModel, clip: float = 1.0) -> float:
-    """How much coarser than white the noise of flat places is: 1 for white, more where pixels share theirs.
+    """Variance of means over 4 x 4 flat pixels, times 16, over that of the pixels: 1 for white noise.
 
-    The variance of means over 4 x 4 pixels, times 16, over that of the pixels, both of differences between
-    neighbours. Demosaicing leaves 6 to 9, a camera's own denoising 40 and more.
+    Demosaicing leaves 6 to 9, a camera's own denoising 40 and more.
     """
     fine = _sampled(np.asarray(plane, dtype=np.float32))
     if min(fine.shape) < GRAIN:

@@ -1,8 +1,7 @@
 """Directories of TIFF tags, read with bounds and written: the skeleton of TIFF, DNG, EXIF and most RAW files.
 
-Reading, every offset is checked against the buffer, loops end, and no count makes us allocate more
-than `MAX_VALUE_BYTES`. A directory that is damaged half-way gives what came before.
-Image libraries that write 16 bits a colour write no EXIF directory.
+Every offset is checked against the buffer, loops end, no count makes us allocate more than `MAX_VALUE_BYTES`;
+a directory that is damaged half-way gives what came before.
 
 Source: "TIFF Revision 6.0", Aldus, 1992, section 2.
 """

@@ -55,11 +55,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class LensIdentity:
-    """Which lens it was, as far as the file says.
-
-    A serial is never blank and never a placeholder such as "0000000000": then it is `None`
-    and `serial_source` is "none".
-    """
+    """Which lens it was, as far as the file says; a placeholder such as "0000000000" is no serial."""
 
     maker: str | None = None  # as the file names them
     model: str | None = None

@@ -23,7 +23,6 @@ from lensmodel.simulate.scenes import (
     edge_chart,
     load_scene,
     slanted_edge_scene,
-    srgb_to_linear,
 )
 
 __all__ = [
@@ -44,6 +43,5 @@ __all__ = [
     "load_scene",
     "photograph",
     "slanted_edge_scene",
-    "srgb_to_linear",
     "write_photo",
 ]

@@ -1,7 +1,6 @@
 """A sensor, and the photo that it takes through a simulated lens: blur by exact kernels, noise, a raw file.
 
-Independent of `lensmodel.correction` and its operators on purpose: what those are tested against must not
-come from them.
+Independent of `lensmodel.correction` on purpose: what is tested against it must not come from it.
 """
 
 from __future__ import annotations
@@ -157,12 +156,9 @@ def blurred(
 
         y = sum_i  k_i * (w_i x)          sum_i w_i = 1,  w_i a triangle in row and column
 
-    They are exact on every second node; those between are cubic splines through them. With the default step
-    the kernel of a point differs from the exact one by a relative L2 of 0.5 to 1.5 percent. Where the margin
-    m is narrower than half a kernel, the scene is mirrored.
-
-    Source: M. Hirsch et al., "Efficient filter flow for space-variant multiframe blind deconvolution", CVPR
-    2010, eq. 2.
+    They are exact on every second node; those between are cubic splines through them (of a relative L2 error
+    of 0.5 to 1.5 percent). Where m is narrower than half a kernel, the scene is mirrored. Source: M. Hirsch
+    et al., "Efficient filter flow for space-variant multiframe blind deconvolution", CVPR 2010, eq. 2.
     """
     options = options or BlurOptions()
     half = options.size // 2

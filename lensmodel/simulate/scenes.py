@@ -1,8 +1,4 @@
-"""What a simulated camera looks at: photographs, and slanted-edge charts.
-
-Every scene is `Planes` in white-balanced linear light. The edges of a chart are exact: every pixel holds the
-area that the edge leaves it.
-"""
+"""What a simulated camera looks at, in white-balanced linear light: photographs, and slanted-edge charts."""
 
 from __future__ import annotations
 
@@ -19,6 +15,7 @@ from PIL import Image, UnidentifiedImageError
 
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
 from lensmodel.core.types import Direction, FieldPosition, Frame, Planes
+from lensmodel.photo.colour import srgb_to_linear
 from lensmodel.quality import Box, edge_area
 
 DEMO_SCENES: Final = ("city", "colosseum", "lake", "spices", "tea-gardens")
@@ -29,13 +26,6 @@ _SLANTS_DEG: Final = (5.0, -5.0, 7.0, -7.0, 4.0, -4.0, 9.0, -9.0)
 _MIN_TILE: Final = 72  # pixels: the crop of an edge and the blur around it
 
 
-def srgb_to_linear(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Undo the sRGB curve (IEC 61966-2-1) on values in 0..1."""
-    v = np.asarray(values, dtype=np.float32)
-    high = ((np.maximum(v, 0.04045) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
-    return np.where(v <= 0.04045, v / np.float32(12.92), high).astype(np.float32)
-
-
 def load_scene(path: str | Path) -> Planes:
     """Load an sRGB photograph (PNG, JPEG, TIFF of 8 bits) as linear light."""
     try:
@@ -43,7 +33,7 @@ def load_scene(path: str | Path) -> Planes:
             coded = np.asarray(image.convert("RGB"), dtype=np.uint8)
     except UnidentifiedImageError as error:
         raise NotAnImageError(f"{Path(path).name} is no image that can serve as a scene") from error
-    table = srgb_to_linear(np.arange(256) / 255.0)
+    table = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
     return np.ascontiguousarray(table[coded].transpose(2, 0, 1))
 
 

@@ -160,13 +160,6 @@ def test_statistics_of_a_wrong_shape_or_not_finite_are_refused(sharp: np.ndarray
         network.encode(broken, PLACES, WIDE_OPEN)
 
 
-def test_weights_say_where_they_come_from() -> None:
-    network = FieldNetwork.load()
-    assert network.provenance["lenses"] > 500
-    assert network.provenance["curve"][-1]["figures"]
-    assert len(network.name) == 12
-
-
 def test_scaled_logits_raise_kernels_to_powers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lensmodel.neural.network.centred_kernels", lambda kernels: kernels)
     plain = FieldNetwork.load()

@@ -63,16 +63,6 @@ def test_noise_below_the_steps_of_8_bits_is_recovered_to_10_percent(shot: float)
     assert found.variance(levels) == pytest.approx(truth, rel=0.1)
 
 
-def test_numbers_of_8_bits_without_other_noise_have_that_of_rounding_at_every_level() -> None:
-    steps = curves_of("srgb")[1][::257]
-    numbers = np.rint(np.interp(scene(600, 800, seed=1, blur=3.0), steps, np.arange(256.0))).astype(np.intp)
-    found = estimate_noise(steps[numbers].astype(np.float32), codes=steps)
-
-    levels = np.array([0.1, 0.3, 0.6])
-    rounding = np.interp(levels, steps, np.gradient(steps) ** 2 / 12)
-    assert (found.variance(levels) > 0.8 * rounding).all()
-
-
 def test_saturated_areas_do_not_count() -> None:
     truth = NoiseModel(1e-3, 1e-6)
     plane = noisy(scene(600, 800, seed=1), truth, seed=2)
@@ -255,14 +245,3 @@ def test_a_damaged_tile_of_a_lossy_dng_leaves_its_noise_unknown(tmp_path: Path, 
     write_lossy_dng(tmp_path / "x.dng", tile)
     with opened_header(tmp_path / "x.dng", photo.Limits()) as header:
         assert (header.kind, header.coarseness) == ("dng", 0.0)
-
-
-@pytest.mark.tools
-def test_a_converters_lossy_dng_is_known_as_such(shared_data: Path) -> None:
-    developed = photo.develop(shared_data / "raw" / "canon_6d_ef24-105_serial.dng")
-    assert developed.info.kind == "dng"
-    assert developed.lossy
-    coded = developed.coding_noise
-    assert coded is not None
-    # tables of a median of 5 at about 1/340 of white a number in the middle tones
-    assert float(coded.variance(np.array(0.18))) == pytest.approx((5 * 0.0029) ** 2 / 12, rel=0.9)

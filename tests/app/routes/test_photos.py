@@ -140,6 +140,22 @@ def test_a_photo_waits_for_its_lens_and_starts_again(client: TestClient, steps: 
     assert (steps.lens_id(photo) == known) == (way != "new_lens")
 
 
+def test_photos_are_named_together(client: TestClient, steps: Steps) -> None:
+    photos = [steps.waiting(aperture=None) for _ in range(2)]
+    named = {
+        "photo_ids": [photo.public_id for photo in photos],
+        "new_lens": {"label": "Mine"},
+        "aperture": 2.0,
+    }
+
+    items = client.patch("/v1/photos", json=named).json()["items"]
+
+    rows = [steps.fresh(photo) for photo in photos]
+    assert [item["state"] for item in items] == ["received"] * 2
+    assert len({row.given["lens_id"] for row in rows}) == 1
+    assert [row.given["aperture"] for row in rows] == [2.0] * 2
+
+
 def test_a_change_happens_wholly_or_not_at_all(client: TestClient, steps: Steps, store: Store) -> None:
     photo = steps.receive()
     store.photos.fail(photo.public_id, 1, "no_usable_patches", "all is sky")

@@ -46,20 +46,17 @@ def test_a_picture_made_a_raw_photo_keeps_one_colour_of_each_pixel_and_its_light
     np.testing.assert_allclose(seen.planes[:, 8:-8, 60], planes[:, 8:-8, 60], rtol=0.02)
 
 
-def test_missing_program_is_named() -> None:
-    peer = Peer("nobody's", "no-such-program", lambda *_: [], 1.0)
-
-    assert not peer.installed
-    with pytest.raises(InvalidInputError, match="no-such-program is not installed"):
-        peer.run(Path("in.tif"), Path(), 1.0)
-
-
-def test_program_that_does_not_end_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_is_missing_or_does_not_end_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(peers, "_LIMIT_S", 0.2)
-    peer = Peer("sleeper", "sleep", lambda *_: ["sleep", "30"], 1.0)
+    missing = Peer("nobody's", "no-such-program", lambda *_: [], 1.0)
+    sleeper = Peer("sleeper", "sleep", lambda *_: ["sleep", "30"], 1.0)
 
-    with pytest.raises(InvalidInputError, match=r"sleep did not end within 0\.2 s"):
-        peer.run(Path("in.tif"), tmp_path, 1.0)
+    assert not missing.installed
+    for peer, said in ((missing, "no-such-program is not"), (sleeper, r"sleep did not end within 0\.2 s")):
+        with pytest.raises(InvalidInputError, match=said):
+            peer.run(Path("in.tif"), tmp_path, 1.0)
 
 
 def test_mosaic_for_raw_peers_keeps_each_colour_at_its_place(tmp_path: Path) -> None:

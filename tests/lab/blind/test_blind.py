@@ -17,12 +17,13 @@ from lab import kernels
 from lab.blind import benchmark, judge
 from lab.blind.benchmark import BlindBenchmark, BlindReport, CaseResult, run_blind_benchmark, summarised
 from lab.cases import _apart, list_photos, load_psfs, make_cases, observe, photo_half, scene_of
+from lab.outside import judged
 from lab.stored import ROOT
 from lensmodel.blind import PsfEstimate
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError, UnknownMethodError
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import FieldPosition, NoiseModel, Plane
+from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, Plane
 from lensmodel.patches import Patch
 
 
@@ -289,3 +290,12 @@ def test_report_has_a_row_and_a_curve_for_each_method_and_no_nan(report: BlindRe
     assert set(names) >= {"narrow", "wide", "no correction"}
     dashed = [line.get_label() for line in axes.get_lines() if line.get_linestyle() == "--"]
     assert dashed == ["no correction"]
+
+
+@pytest.mark.tools
+def test_a_lens_learned_from_a_photo_of_the_sky_has_the_psfs_of_its_stars(shared_data: Path) -> None:
+    rows = list(judged(shared_data / "psf" / "starfield_a.tiff", LensSettings(aperture=2.8)))
+    assert len(rows) >= 5  # of seven: in one cell stars are not single, in another they do not agree
+    blind, point = (np.median([getattr(row, name) for row in rows]) for name in ("distance", "point"))
+    assert blind < min(0.25, 0.7 * point)
+    assert [row.measured_px for row in rows] == pytest.approx([row.blind_px for row in rows], abs=0.25)

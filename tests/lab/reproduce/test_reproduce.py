@@ -388,19 +388,16 @@ def test_page_shows_every_way_lens_and_refusal_and_needs_nothing_from_outside(tm
     shown += ["| default, n = 1 | 160 |", f"| {RIVAL} | 130 |", "| default | 4 |"]
     for row in (*shown, *(f"| {way} | {value} |" for value in ("140", "0.600", "31.50"))):
         assert row in markdown
+    stored = json.loads(write_json(made, tmp_path / "all.json").read_text(encoding="utf-8"))
+    assert stored["summary"]["third order"]["share"]["1"]["corner"] == pytest.approx(0.6)
+    assert stored["cases"][0]["states"]["n = 1"]["psnr"]["mid"] == 32.0
+    assert stored["bars_held"] == held(bars(made))
+    assert {"name", "place", "value", "low", "high", "met"} <= stored["bars"][0].keys()
     assert "Lens &lt;0&gt;" in html
     assert not re.search(r"https?:|//[a-z]|<script|<link|@import", html)
     sources = re.findall(r'src="([^"]+)"', html)
     assert "pictures/fig1-blind-er-1percent.png" in sources
     assert all(source.startswith("pictures/") for source in sources)
-
-
-def test_json_holds_results_summary_and_bars(tmp_path: Path) -> None:
-    stored = json.loads(write_json(result((160, 32.0)), tmp_path / "all.json").read_text(encoding="utf-8"))
-    assert stored["summary"]["third order"]["share"]["1"]["corner"] == pytest.approx(0.6)
-    assert stored["cases"][0]["states"]["n = 1"]["psnr"]["mid"] == 32.0
-    assert stored["bars_held"] == held(bars(result((160, 32.0))))
-    assert {"name", "place", "value", "low", "high", "met"} <= stored["bars"][0].keys()
 
 
 def test_true_kernels_have_no_error(

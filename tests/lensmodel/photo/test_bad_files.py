@@ -91,7 +91,7 @@ def test_bad_files_are_refused_in_our_words_or_are_photos(shared_data: Path) -> 
             assert shape == (3, *PHOTOS[path.name]), path.name
 
 
-@pytest.mark.slow  # damaged headers are read in this process in test_inspect.py
+@pytest.mark.slow  # damaged headers are read in this process in test_containers.py
 @pytest.mark.tools
 def test_damaged_copies_of_real_files_never_escape(shared_data: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)

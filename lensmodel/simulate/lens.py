@@ -8,24 +8,22 @@ behind the exit pupil is transformed, its intensity is integrated over square pi
 
 A ray through p lands at x = 2 lambda N grad W: a positive gradient outwards throws light outwards.
 
-|E|^2 is band limited to 1 / (lambda N). It is sampled finely enough to carry that band, the pixel is its
-exact spectrum sinc(fx) sinc(fy), and a matrix Fourier transform then evaluates the result at the middles of
-the pixels, wherever the kernel is to be centred. Nothing is interpolated, so nothing adds blur or ringing.
-
-Sources: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, ch. 5 and 6; R. Soummer et al., "Fast
-computation of Lyot-style coronagraph propagation", Optics Express 15, 2007, eq. 1 (the matrix Fourier
-transform).
-
-The wavefront is that of third-order theory with the faults of a single copy added. With the pupil p (right,
-up; |p| <= 1), the field h (right, up; |h| = r), and h' = h - decentring::
+|E|^2 is sampled finely enough to carry its band, 1 / (lambda N), the pixel is its exact spectrum
+sinc(fx) sinc(fy), and a matrix Fourier transform evaluates the result wherever the kernel is to be centred:
+nothing is interpolated. The wavefront is that of third-order theory with the faults of a single copy added.
+With the pupil p (right, up; |p| <= 1), the field h (right, up; |h| = r), and h' = h - decentring::
 
     W = W040 |p|^4 + W131 (h'.p) |p|^2 + W222 (h'.p)^2 + W220 |h'|^2 |p|^2
         + (W020 + tilt.h + c1 t + c2 t^2) |p|^2                    t = (lambda - 540 nm) / 100 nm
         + (coma.p) |p|^2 + a (px^2 - py^2) + 2 b px py
 
 in waves of 540 nm at the open aperture N0. Stopping down to N shrinks the pupil by s = N0 / N, so that a term
-of degree n in p shrinks by s^n. Source: W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 7 and 8;
-the faults of a copy after K. P. Thompson, JOSA A 22, 2005.
+of degree n in p shrinks by s^n.
+
+Sources: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, ch. 5 and 6; R. Soummer et al., "Fast
+computation of Lyot-style coronagraph propagation", Optics Express 15, 2007, eq. 1 (the matrix Fourier
+transform); W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 7 and 8; the faults of a copy after
+K. P. Thompson, JOSA A 22, 2005.
 """
 
 from __future__ import annotations
@@ -327,8 +325,7 @@ class Aberrations:
     uniform_astigmatism: tuple[float, float] = (0.0, 0.0)
     tilt: tuple[float, float] = (0.0, 0.0)  # defocus per unit of field towards (right, up)
     colour_focus: tuple[float, float] = (0.0, 0.0)  # longitudinal colour: c1, c2
-    # Cat's eye: radius of the second circle over that of the pupil, and its shift per unit of field. A radius
-    # of 0 means none.
+    # cat's eye: radius of the second circle over that of the pupil, 0 for none, and its shift a unit of field
     vignetting: tuple[float, float] = (0.0, 0.0)
     # lateral colour against green: displacement outwards = c1 r + c3 r^3 in half diagonals
     lateral_red: tuple[float, float] = (0.0, 0.0)

@@ -210,7 +210,6 @@ class Solved:
     light: float
     shift: tuple[float, float]  # its centre of mass, (row, col) pixels from the middle
     error: float  # expected relative L2
-    misfit: float  # mean squared residual over that of the noise: q
 
 
 def solve(
@@ -264,7 +263,6 @@ def solve(
         light=light,
         shift=(off[0] + moved[0], off[1] + moved[1]),
         error=_error_of(eq.a + np.diag(prior), k),
-        misfit=misfit,
     )
 
 

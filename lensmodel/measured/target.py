@@ -43,7 +43,7 @@ from scipy.signal.windows import tukey
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.files import atomic
-from lensmodel.core.types import Kernel, StepHook
+from lensmodel.core.types import Channel, Kernel, StepHook
 from lensmodel.measured.measurer import (
     SMALL,
     MeasuredPsf,
@@ -225,13 +225,9 @@ def on_paper(path: Path, paper: str) -> tuple[float, float]:
 # --- its PSFs ------------------------------------------------------------------------------------
 
 FLOOR: Final = 0.02  # error that no window shows of itself: of the models of light, tones and place (chosen)
-# Residuals over the noise above which a window is cut: for noise stated a tenth too low it is not (chosen)
-EXPLAINED: Final = 1.15
 _TOO_SMALL: Final = "the page is too small in the photo; go nearer until it nearly fills the frame"
 _SIDE: Final = 144  # pixels of a window: wide enough for the largest kernel, small enough for one (chosen)
 _SURE: Final = 0.3  # error beyond which a measurement is not worth having
-_SMALLER: Final = (2 / 3, 1 / 2)  # of the side: the kernel changes less in such windows (chosen)
-_LEAST_PIXELS: Final = 2.0  # for each of the kernel: fewer leave it to the prior (chosen)
 _TONE_WINDOWS: Final = 6  # in the middle of the frame, where the lens is sharpest (chosen)
 _TRIED: Final = 6  # windows looked at along each axis for one that is measured: the page may end anywhere
 
@@ -270,9 +266,12 @@ class Target(Measurer):
         middle = sorted(corners, key=lambda c: np.hypot(*(np.add(c, self.side / 2) - photo.frame.center)))
         tones = tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side, on_step)
         placed = replace(placed, tones=tones)
-        return corners, lambda corner, channel: self._window(
-            placed, Window.of(photo, channel, corner, self.side), size
-        )
+
+        def psf_in(corner: tuple[int, int], channel: Channel) -> MeasuredPsf:
+            best = solve_window(Window.of(photo, channel, corner, self.side), placed, size)
+            return best.window.psf(best.kernel, best.solved.error, FLOOR, _SURE)
+
+        return corners, psf_in
 
     def find(self, photo: LinearPhoto, on_step: StepHook) -> PlacedPage:
         """Find the page in a photo and register it to a fraction of a pixel."""
@@ -286,18 +285,6 @@ class Target(Measurer):
                 plane, corners, side, degree, on_step,
             )  # fmt: skip
         return replace(placed, warp=warp)
-
-    def _window(self, placed: PlacedPage, window: Window, size: int) -> MeasuredPsf:
-        """Solve a window, and smaller ones at its middle as long as the kernel changes too much within."""
-        best = solve_window(window, placed, size)
-        for part in _SMALLER:
-            side = round(self.side * part)
-            few = window.measured.sum() * (side / self.side) ** 2 < _LEAST_PIXELS * size * size
-            if best.solved.misfit <= EXPLAINED or few:
-                break
-            row, col = (at + (self.side - side) // 2 for at in window.corner)
-            best = solve_window(Window.of(window.photo, window.channel, (row, col), side), placed, size)
-        return best.window.psf(best.kernel, best.solved.error, FLOOR, _SURE)
 
 
 def _identified(photo: LinearPhoto, details: Sequence[int], on_step: StepHook) -> PlacedPage:
@@ -345,7 +332,6 @@ _POWERS: Final = ((1.0, 0.0, 0.0), (-2.0 * MEAN, 1.0, 0.0), (3.0 * MEAN**2, -3.0
 _TINY: Final = 1e-20  # keeps a division finite
 _FINE: Final = 2  # samples a pixel that the page is drawn with: at 1, its dots would alias (chosen for time)
 _SPARE: Final = 16  # pixels around a window, where the taper is: as far as half of a kernel (chosen)
-_LIGHT_ROUNDS: Final = 2  # the second corrects what the first took for the kernel (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -401,9 +387,8 @@ def solve_window(window: Window, placed: PlacedPage, size: int) -> SolvedWindow:
         return page(shift, margin) * (window_terms(side, margin) @ light)
 
     light = np.eye(6)[0]
-    for _ in range(_LIGHT_ROUNDS):  # light and a small kernel, each found with the other
-        rough, shift = roughly(window, lit)
-        light = _fitted_light(window, page(shift, SMALL // 2), rough.kernel)
+    rough, shift = roughly(window, lit)
+    light = _fitted_light(window, page(shift, SMALL // 2), rough.kernel)
     kernel, solved, shift = window_psf(window, lit, size)
     return SolvedWindow(window, kernel, solved, shift, light)
 

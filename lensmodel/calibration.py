@@ -26,7 +26,6 @@ from lensmodel.core import processes
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError
 from lensmodel.core.psf import PsfSample
 from lensmodel.lens import Lens
-from lensmodel.measured import is_measured
 from lensmodel.model import LensModel, LensProfile, ModelSettings
 from lensmodel.model.profile import Identity, difference
 from lensmodel.photo import PhotoMetadata
@@ -189,7 +188,7 @@ def joined(model: LensModel, samples: Sequence[PsfSample], *, replace: bool = Fa
     """Add samples to a model; `replace` drops its blind ones of the same settings."""
     if not replace:
         return model.added(samples)
-    kept = [old for old in model.samples if is_measured(old) or not any(_alike(old, new) for new in samples)]
+    kept = [old for old in model.samples if old.measured or not any(_alike(old, new) for new in samples)]
     return LensModel.fit([*kept, *samples], model.settings)
 
 

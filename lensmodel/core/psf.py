@@ -179,6 +179,10 @@ class EncodedPatch:
         return cls(numbers[TOKEN_LENGTH:], numbers[:TOKEN_LENGTH], KINDS[data[0]])
 
 
+MEASURED: Final = "measured-"
+"""How the names of estimators begin that measure: blind ones never do."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PsfSample:
     """One local PSF estimate: what was seen, where, at which settings, how sure.
@@ -235,6 +239,11 @@ class PsfSample:
                 raise InvalidInputError(f"the {name} must be positive {unit}, got {size}")
         if self.error is not None and not (math.isfinite(self.error) and self.error >= 0.0):
             raise InvalidInputError(f"the expected error must be finite and not negative, got {self.error}")
+
+    @property
+    def measured(self) -> bool:
+        """Whether it was measured on a photo made for it, and not estimated from an ordinary one."""
+        return self.estimator.startswith(MEASURED)
 
 
 def places_of(samples: Iterable[PsfSample]) -> int:

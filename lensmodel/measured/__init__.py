@@ -11,7 +11,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.measured.edges import SlantedEdges, print_chart
-from lensmodel.measured.measurer import MeasuredPsf, Measurer, is_measured, samples_of
+from lensmodel.measured.measurer import MeasuredPsf, Measurer, samples_of
 from lensmodel.measured.pair import AperturePair
 from lensmodel.measured.points import Points
 from lensmodel.measured.target import DETAILS, PAPERS, Target, TargetPage, print_target
@@ -27,7 +27,6 @@ __all__ = [
     "MeasuredPsf",
     "Measurer",
     "TargetPage",
-    "is_measured",
     "measurements_of",
     "methods",
     "print_chart",

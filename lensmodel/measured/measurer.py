@@ -49,7 +49,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
 from lensmodel.core.numerics import fista, nonnegative_least_squares, on_simplex
-from lensmodel.core.psf import PsfSample, as_kernel, centred, centroid
+from lensmodel.core.psf import MEASURED, PsfSample, as_kernel, centred, centroid
 from lensmodel.core.types import (
     CHANNELS,
     Channel,
@@ -61,8 +61,6 @@ from lensmodel.core.types import (
     ignore_step,
 )
 from lensmodel.photo import LinearPhoto
-
-PREFIX = "measured-"  # How the names of measuring estimators begin: blind ones never do
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,17 +147,12 @@ def samples_of(
             weight=1.0,
             photo=photo_id,
             pixel_pitch_um=photo.info.metadata.pixel_pitch_um,
-            estimator=f"{PREFIX}{method.name}/{method.version}",
+            estimator=f"{MEASURED}{method.name}/{method.version}",
             error=psf.error,
             half_diagonal_px=photo.frame.half_diagonal,
         )
         for psf in measured
     ]
-
-
-def is_measured(sample: PsfSample) -> bool:
-    """Whether a sample was measured, and not estimated from an ordinary photo."""
-    return sample.estimator.startswith(PREFIX)
 
 
 def psf_at(

@@ -155,8 +155,10 @@ def read_profile(source: Path | str | IO[bytes], name: str) -> LensProfile:
                 f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
+        chosen = dict(document["model"])
+        excluded = chosen.pop("excluded", ())  # photos that do not count, of earlier profiles
         samples = unpack_samples(PackedSamples(entries, stack, encoded))
-        model = LensModel.fit(samples, ModelSettings(**document["model"]))
+        model = LensModel.fit([s for s in samples if s.photo not in excluded], ModelSettings(**chosen))
         cameras = (_texts(camera) for camera in document.get("cameras", []))
         return LensProfile(
             model,

@@ -33,7 +33,6 @@ from scipy import special
 
 from lensmodel.core.psf import WING_LEVEL, PsfSample, rms_width
 from lensmodel.core.types import LensSettings
-from lensmodel.measured import is_measured
 from lensmodel.model import LensModel
 
 # Field radius at which opposite sides are compared (chosen: the short sides of a 3:2 frame are at 0.83)
@@ -107,7 +106,7 @@ def centring(model: LensModel, settings: LensSettings) -> Centring:
         third = np.array([_third_moment(samples[i]) for i in inner])
         constant = np.concatenate([np.broadcast_to(np.eye(2), (len(inner), 2, 2)), h[inner, :, None]], axis=2)
         coma = _asymmetry(root[inner, :, None] * constant, root[inner] * third, photos[inner])
-    measured = all(is_measured(sample) for sample in samples)
+    measured = all(sample.measured for sample in samples)
     return _verdict(softer, coma, int(photos.max()) + 1, measured=measured)
 
 

@@ -33,7 +33,6 @@ from lensmodel.core.types import (
     ignore_step,
     zone_of,
 )
-from lensmodel.measured import is_measured
 from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.quality import crossing, mtf50_from_kernel, mtf_from_kernel
 from lensmodel.report.centring import Centring, centring, direction_in_words
@@ -328,7 +327,7 @@ def lens_report(
     named = [(place_in_words(at), at) for at in (*grid(rows, cols, aspect), center, *corner_places(aspect))]
     named += [(f"the {direction_in_words(at.phi)}", at) for at in side_places(aspect)]
     outside = _outside_chart(model, [at for _, at in named])
-    measured = all(is_measured(sample) for sample in model.samples)
+    measured = all(sample.measured for sample in model.samples)
     pitch = _shared(sample.pixel_pitch_um for sample in model.samples)
     numbers = _chosen(model) if apertures is None else apertures
     wanted = [LensSettings(aperture=n) for n in numbers] or [LensSettings()]
@@ -503,7 +502,7 @@ def filled_aspect(model: LensModel) -> float:
 
     A chart has a shape of its own, and says nothing of the frame's.
     """
-    places = [s.position.xy for s in model.samples if not is_measured(s)] or [(0.0, 0.0)]
+    places = [s.position.xy for s in model.samples if not s.measured] or [(0.0, 0.0)]
     reached = np.abs(places).max(axis=0)
     shares = {aspect: reached / half_sides(aspect) for aspect in _ASPECTS}
     inside = {

@@ -490,7 +490,7 @@ def test_measured_samples_join_or_replace_blind_ones(target_photo: LinearPhoto) 
         [place], method, target_photo, photo_id="new", settings=LensSettings(aperture=2.0)
     )
     assert samples[0].estimator == "measured-target/1"
-    assert measure.is_measured(samples[0])
+    assert samples[0].measured
     model = LensModel.fit(blind)
     assert [s.photo for s in joined(model, samples).samples] == ["old", "other", "new"]
     assert [s.photo for s in joined(model, samples, replace=True).samples] == ["other", "new"]

@@ -169,6 +169,13 @@ def changed(folder: Path, change: dict[str, object]) -> Path:
     return path
 
 
+def test_earlier_profiles_open_without_the_photos_that_they_leave_out(tmp_path: Path) -> None:
+    before = profile().model.samples
+    after = load_profile(changed(tmp_path, {"model": {"excluded": ["p1"]}})).model
+
+    assert {sample.photo for sample in after.samples} == {sample.photo for sample in before} - {"p1"}
+
+
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nonsense", b"\x80\x04pickle"])
 def test_other_bytes_are_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.lensprofile").write_bytes(content)

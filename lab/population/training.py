@@ -25,22 +25,12 @@ from lab.images import zone_masks
 from lab.population.sets import Lens, Set, draw_set, load_library
 from lensmodel.core.files import write_atomically
 from lensmodel.neural import FieldNetwork, network
-from lensmodel.neural.network import (
-    BLOCK,
-    COARSE,
-    CONDITION,
-    DISTANCES,
-    FINE,
-    PLACE,
-    RELATION,
-    RINGS,
-    outer_cells,
-)
+from lensmodel.neural.network import BLOCK, COARSE, CONDITION, DISTANCES, FINE, PLACE, RELATION, RINGS
 from lensmodel.neural.statistics import LENGTH
 
 WIDTH, HEADS, HIDDEN, COMPONENTS = 192, 6, 384, 224
 ENCODER_BLOCKS, DECODER_BLOCKS = 2, 3
-_OUTER: Final = int(outer_cells().sum())
+_OUTER: Final = int(network.outer_cells().sum())
 _LOGITS: Final = FINE * FINE + _OUTER
 
 _SET_SIZES: Final = ((1, 2, 4, 8, 16, 32, 64, 110), (0.05, 0.04, 0.06, 0.12, 0.18, 0.22, 0.2, 0.13))
@@ -171,7 +161,7 @@ def _ring_matrix() -> NDArray[np.float32]:
 
 
 _RING_MATRIX: Final = torch.from_numpy(_ring_matrix())
-_OUTER_INDEX: Final = torch.from_numpy(np.nonzero(outer_cells().ravel())[0])
+_OUTER_INDEX: Final = torch.from_numpy(np.nonzero(network.outer_cells().ravel())[0])
 
 
 def losses(shares: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:

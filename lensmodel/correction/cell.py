@@ -110,11 +110,7 @@ def usual_pitch(frame: Frame, factor: int = 1) -> int:
 
 
 def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
-    """Cut a frame into cells, row by row.
-
-    The lattice depends on the frame only, never on the requested part or on the available memory,
-    so a preview shows the same pixels as the whole picture. The `pitch` is the side of a cell in pixels.
-    """
+    """Cut a frame into cells of a side of `pitch` pixels, row by row; a preview has the same as the whole."""
     pitch = usual_pitch(frame) if pitch is None else pitch
     down, across = _pieces(frame.height, pitch), _pieces(frame.width, pitch)
     rows, cols = [piece[2] for piece in down], [piece[2] for piece in across]
@@ -411,9 +407,8 @@ def blur_of(
 ) -> UniformBlur:
     """Blur of one channel at a place: a share of its kernel, the rest a point, moved by lateral colour.
 
-    Too wide a kernel costs far more than one that is too narrow. The residual of a wrong kernel is not noise:
-    counted as noise, it would leave strong edges to the prior, which spreads their colour over what lies
-    beside them.
+    The residual of a wrong kernel does not count as noise, or strong edges would be left to the prior, which
+    spreads their colour over what lies beside them.
     """
     kernel, offset = posterior.kernel, (0.0, 0.0)
     if share < 1.0:

@@ -19,7 +19,7 @@ from scipy import fft
 from lensmodel.core.numerics import jit
 from lensmodel.core.psf import delta
 from lensmodel.core.types import Planes, Zone
-from lensmodel.correction.blur import Complex, Number, Real, UniformBlur, to_spectrum
+from lensmodel.correction.blur import Complex, Number, Real, UniformBlur
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.posterior import GRID, WIDEST, PsfPosterior
 
@@ -91,31 +91,11 @@ def ring_power(planes: Planes) -> NDArray[np.float64]:
         np.linspace(0, n - g, min(max(n // g, 1), _BLOCKS)).astype(int)
         for n, g in zip(planes.shape[1:], GRID, strict=True)
     )
-    power = np.empty((len(planes), len(rows) * len(cols), GRID[0], GRID[1] // 2 + 1), dtype=np.float32)
-    _block_power(planes, rows, cols, _window(), power)
+    blocks = np.stack([planes[:, i : i + GRID[0], j : j + GRID[1]] for i in rows for j in cols], axis=1)
+    spectra = fft.rfft2((blocks - blocks.mean(axis=(2, 3), keepdims=True)) * _window())
+    power = spectra.real**2 + spectra.imag**2
     rings = power.reshape(*power.shape[:2], -1) @ _rings().T.astype(np.float32)
     return np.asarray(rings / (GRID[0] * GRID[1]), dtype=np.float64)
-
-
-@jit
-def _block_power(
-    planes: Planes, rows: NDArray[np.intp], cols: NDArray[np.intp], window: Real, power: Real
-) -> None:
-    """Power of windowed blocks of planes, less their means."""
-    height, width = window.shape
-    block, spectrum = np.empty((height, width), np.float32), np.empty((height, width // 2 + 1), np.complex64)
-    for c in range(planes.shape[0]):
-        for k, top in enumerate(rows):
-            for l, left in enumerate(cols):
-                into = power[c, k * len(cols) + l]
-                block[:] = planes[c, top : top + height, left : left + width]
-                block -= block.mean()
-                block *= window
-                to_spectrum(block, spectrum)
-                for i in range(height):
-                    for j in range(spectrum.shape[1]):
-                        value = spectrum[i, j]
-                        into[i, j] = value.real * value.real + value.imag * value.imag
 
 
 @lru_cache(maxsize=1)

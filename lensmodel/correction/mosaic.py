@@ -53,12 +53,11 @@ def refill(
 ) -> None:
     """Fill in red and blue where no pixel measured them, in place, as the lens would show them.
 
-    Demosaicing copies fine detail from green into red and blue. Behind a lens that is sharp in green and
-    soft in blue, as most are, that detail is sharper than blue light can be, and undoing blue's blur on
-    it makes coloured edges of it. So the detail is blurred first as the colour itself is: with x_g Wiener's
-    estimate of green, each colour is predicted from p = K_c x_g by residual interpolation, a line
+    Demosaicing copies detail from green that is sharper than blue light can be behind most lenses, of which
+    undoing blue's blur would make coloured edges. So it is blurred first as the colour itself is: with x_g
+    Wiener's estimate of green, each colour is predicted from p = K_c x_g by residual interpolation, a line
     y = a p + b in each window, and the residual at measured pixels is interpolated. No frequency of p is
-    stronger than in green itself: a blue that is believed to be sharper would get the mosaic's own pattern::
+    stronger than in green itself, or the mosaic's own pattern would come back::
 
         y_c = a p + b + interpolated( y_c - a p - b )
 

@@ -115,11 +115,7 @@ class SaturationAwareRichardsonLucy:
 
 
 def first_guess(blurred: Plane, blur: UniformBlur) -> tuple[Plane, Plane]:
-    """Back-projected data as a start, and the normaliser F^T 1.
-
-    F^T 1 falls below 1 where part of the light fell outside the frame. It is floored: latent
-    pixels that hardly touch the data must not explode; they start from the nearest data.
-    """
+    """Back-projected data as a start, and the normaliser F^T 1, floored where little light met the frame."""
     light = np.maximum(blurred, _TINY)
     reach = blur.covered(blurred.shape)
     floor = _REACH_FLOOR * float(reach.max())
@@ -441,10 +437,7 @@ class Lights:
 
 
 def regions(lights: Mask, reach: int) -> list[tuple[Window, Mask]]:
-    """Windows of a tile in which lights are estimated together.
-
-    Each is the data to use, and the light that only this window estimates, `reach` wider on each side.
-    """
+    """Windows of a tile to estimate lights in, each with the light that it alone does, `reach` wider."""
     if not lights.any():
         return []
     near = ndimage.maximum_filter(np.pad(lights, reach), 2 * reach + 1)
@@ -479,11 +472,7 @@ def compact(clipped: Mask, reach: int) -> Mask:
 
 
 def positive(blur: UniformBlur) -> UniformBlur:
-    """The same blur, its shift by parts of a pixel in the kernel, so that no light becomes negative.
-
-    A shift that acts as a phase belongs to a kernel with negative lobes, behind which Richardson-Lucy steps
-    run away.
-    """
+    """The same blur, its shift in a kernel without negative lobes, behind which the steps would run away."""
     if blur.offset == (0.0, 0.0):
         return blur
     wide = blur.reach - blur.kernel.shape[0] // 2
@@ -529,10 +518,7 @@ def _estimate(
 
 
 def _believable(excess: Real, bound: Real, blur: UniformBlur) -> tuple[Real, Real]:
-    """Return the estimated light and its glow, dimmed where the glow far exceeds a bound; none if that fails.
-
-    Steps may run away: just below clipping the response hardly rises.
-    """
+    """Return the estimated light and its glow, dimmed where steps ran away; none if that fails."""
     glow = blur.forward(excess)
     absurd = ~(np.abs(glow) <= _ABSURD * bound)
     if absurd.any():

@@ -158,41 +158,18 @@ def correct_planes(
     pitch: int | None = None,
     on_step: StepHook = ignore_step,
 ) -> Corrected:
-    """Remove the lens blur of a photo.
+    """Remove the lens blur of a photo, `(3, height, width)` in linear light, saturation 1.
 
-    The frame is cut into cells that are fixed in the field. Each is restored with the PSF of its
-    centre and a halo of the PSF's own reach, and faded into its neighbours. Cells are added in a
-    fixed order, so the result does not depend on the number of workers to the last bit.
-
-    Parameters
-    ----------
-    planes : Planes, shape (3, height, width)
-        Linear light, saturation 1; may be memory-mapped.
-    field, psf_error : PsfField or PosteriorField, float
-        The lens, and the expected relative L2 error of the PSFs of a `PsfField`.
-    noise, clip : sequence of NoiseModel, sequence of float
-        By channel; at and above its level of `clip` a value is only a lower bound.
-    lateral : LateralColour or None
-        Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
-        nothing is interpolated. Leave it out where the planes were resampled before.
-    cfa : BayerPattern or None
-        The mosaic on which the planes were measured; what demosaicing filled in is then not data, and
-        "standard" and "fast" demosaic and deblur in one step. `noise` is then that of the sensor.
-    layers : sequence of Bounds
-        Further bounds within which to correct the photo, for a preview: they share the solution, a third of
-        the work.
-    unguarded : bool
-        Return what the method makes of the PSFs as they are: nothing is weighed, bounded, added back or
-        audited, as in a paper's own experiments. Not for photos that anyone wants to keep.
-    least_gain_db : float or None
-        Correct some cells first, and return the photo as it is where they gain less than this.
-    processed : bool
-        Whether a camera sharpened, denoised and compressed the photo: then less of the correction is made the
-        larger the expected error of the PSF.
-    roi : tuple of int or None
-        `(top, left, height, width)`: return only this part, with the same pixels as the whole.
-    pitch : int or None
-        Side of a cell in pixels; None chooses.
+    The frame is cut into cells that are fixed in the field. Each is restored with the PSF of its centre and a
+    halo of the PSF's own reach, and faded into its neighbours. Cells are added in a fixed order, so the
+    result does not depend on the number of workers to the last bit. `psf_error` is the expected relative L2
+    error of the PSFs of a `PsfField`. `lateral` colour becomes part of the red and blue PSFs. Of a mosaic
+    `cfa`, what demosaicing filled in is not data, and `noise` is the sensor's. `layers` are further bounds
+    within which to correct the photo, for a preview: they share the solution. `unguarded` returns what the
+    method makes of the PSFs as they are, as in a paper's own experiments: not for photos to keep. Where
+    cells gain less than `least_gain_db`, the photo stays as it is. A camera has `processed` a photo that it
+    sharpened, denoised and compressed. `roi`, `(top, left, height, width)`, is a part with the same pixels as
+    the whole; `pitch` is the side of a cell in pixels.
     """
     if workers < 1:
         raise InvalidInputError(f"workers must be at least 1, got {workers}")
@@ -362,11 +339,8 @@ def tell_of_compiling() -> None:
 
 
 def _keep_freed_memory() -> None:
-    """Let the C library keep what a cell frees for the next one.
+    """Let the C library keep what a cell frees for the next one: a quarter of the time of "fast".
 
-    The arrays of a cell take some megabytes each. glibc returns such memory to the system as soon as it is
-    freed, and the system clears every page again for the next cell, which took a quarter of the time of
-    "fast". It stops doing so for blocks smaller than the largest block, up to 32 MiB, that it has seen freed;
-    the pages of this one are never touched. Other C libraries are not affected.
+    glibc does so for blocks smaller than the largest, up to 32 MiB, that it has seen freed.
     """
     np.empty(31 << 20, dtype=np.uint8)

@@ -33,8 +33,7 @@ from lensmodel.core.types import (
     ignore_step,
     zone_of,
 )
-from lensmodel.model import LensModel, ModelSettings
-from lensmodel.model import query as va
+from lensmodel.model import LensModel, ModelSettings, query
 from lensmodel.model.bandwidths import reference_bandwidth
 from lensmodel.model.query import MODES
 from lensmodel.simulate import draw_lens
@@ -72,7 +71,7 @@ class PaperModel:
         """Build the tree; that is all the training there is."""
         if not samples:
             raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
-        where = va.points(samples)
+        where = query.points(samples)
         varying = tuple(c for c in (3, 4, 5, 6) if np.isfinite(where[:, c]).all() and np.ptp(where[:, c]) > 0)
         points = np.concatenate(
             [_cloud(s.position, row, varying, len(s.kernel)) for s, row in zip(samples, where, strict=True)]
@@ -87,7 +86,7 @@ class PaperModel:
 
     def kernel_at_settings(self, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:
         """Kernel of odd side `size` at a place, in the image frame; unknown settings count as 0."""
-        row = np.nan_to_num(va.point(position, settings), nan=0.0)
+        row = np.nan_to_num(query.point(position, settings), nan=0.0)
         asked = _cloud(position, row, self.columns, size) / self.scale
         distance, index = self.tree.query(asked, k=min(NEIGHBOURS, self.tree.n))
         near = np.exp(-0.5 * (distance**2 - (distance**2).min(axis=1, keepdims=True)))

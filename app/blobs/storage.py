@@ -1,4 +1,4 @@
-"""Blobs: photos, statistics and results, in a local folder or in an object store.
+"""Blobs: photos, results, previews and reports, in a local folder or in an object store.
 
 Keys are made of our own ids only, never of a name that a client sent. A blob appears under its
 key only when it is complete.

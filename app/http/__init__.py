@@ -1,1 +1,1 @@
-"""What HTTP needs besides the routes: middleware, bodies, errors, uploads, formats of answers."""
+"""What HTTP needs besides the routes: middleware, bodies, errors, uploads."""

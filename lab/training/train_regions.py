@@ -1,4 +1,4 @@
-"""Train the learned choice of patches (`lensmodel.patches.select`).
+"""Train the learned choice of patches (`lensmodel.patches.good_regions`).
 
     python -m lab.training.train_regions collect PHOTOS TABLE.jsonl [GROUPS [METHOD]]
     python -m lab.training.train_regions fit TABLE.jsonl MODEL.npz

@@ -1,7 +1,4 @@
-"""Richardson-Lucy: accelerated, aware of clipped pixels; and the light that such steps find.
-
-Light of clipped pixels, and light from beyond the frame.
-"""
+"""Richardson-Lucy: accelerated, aware of clipped pixels; and the light of these that such steps find."""
 
 from __future__ import annotations
 

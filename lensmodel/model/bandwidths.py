@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM
-from lensmodel.model import query as va
+from lensmodel.model import query
 from lensmodel.model.query import PAPER, ModelSettings
 
 FALLBACK: Final[Mapping[str, float]] = {
@@ -80,7 +80,7 @@ def bandwidths(
     """
     n = int(np.unique(where[:, 4], return_counts=True)[1].max())
     known = {column: where[~np.isnan(where[:, column]), column] for column in (3, 5, 6)}
-    spread = {va.COLUMNS[c]: float(values.std()) if values.size else 0.0 for c, values in known.items()}
+    spread = {query.COLUMNS[c]: float(values.std()) if values.size else 0.0 for c, values in known.items()}
     varying = {name: sigma for name, sigma in spread.items() if sigma > _SAME}
     d = 2 + len(varying)
     # the paper's own way is eq. (8) as it stands
@@ -217,7 +217,7 @@ def cross_validate(
     """Choose bandwidths by cross-validation, weigh samples robustly; `upright` gives the kernels of rows."""
     paper = settings.mode == PAPER
     photo = np.unique([s.photo for s in samples], return_inverse=True)[1]
-    groups, scale = _held_together(photo, where[:, 5]), va.scales(bandwidths(where, settings))
+    groups, scale = _held_together(photo, where[:, 5]), query.scales(bandwidths(where, settings))
     counting = np.flatnonzero(base > 0)
     automatic = not paper and len(np.unique(photo[counting])) >= _CV_PHOTOS
     searched = _thinned(counting[_judging(where[counting, 4])], _CV_SAMPLES)

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.psf import KINDS, PatchKind, PsfSample, centred
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
-from lensmodel.model import camera_bodies
-from lensmodel.model import query as va
+from lensmodel.model import camera_bodies, query
 from lensmodel.model.query import Part
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, Memory
 
@@ -28,7 +27,7 @@ NEAREST: Final = 256  # samples that a question attends to (chosen: the patches 
 
 _CANDIDATES: Final = 4 * NEAREST  # among which the photos share (chosen: a dozen photos at one place)
 # steps of x, y, stops, octaves and dioptres within which questions share a neighbourhood (chosen)
-_CELL: Final = np.array([0.25, 0.25, 1.0 / 3.0, 0.25, 0.5]) / va.UNITS
+_CELL: Final = np.array([0.25, 0.25, 1.0 / 3.0, 0.25, 0.5]) / query.UNITS
 _MEMORIES: Final = 64  # neighbourhoods whose keys are kept (chosen: a whole picture's, a megabyte each)
 _ANSWERS: Final = 64  # that are kept: of all channels, which are asked for one after the other (chosen)
 _ROW_BYTES: Final = 200  # of a patch besides its token: place, settings, its part of the tree
@@ -45,7 +44,7 @@ class LearnedField:
         ]
         self._tokens = _tokens(samples, self._conditions, self.network)
         self._xy = np.array([s.position.xy for s in samples])  # half diagonals, to the right and up
-        self._where = va.all_in_units(samples)
+        self._where = query.all_in_units(samples)
         unknown = np.isnan(self._where)
         columns = zip(self._where.T, ~unknown.T, strict=True)
         self._usual = np.array([np.median(column[has]) if has.any() else 0.0 for column, has in columns])
@@ -66,7 +65,7 @@ class LearnedField:
             min(float(answer.error[channel]), 1.0),
             np.asarray(answer.weights, dtype=np.float64),
             self._photos[rows],
-            va.Support.of(self._where[rows], va.in_units(position, settings)),
+            query.Support.of(self._where[rows], query.in_units(position, settings)),
             np.asarray(answer.ring_error[channel], dtype=np.float64),
         )
 
@@ -77,7 +76,7 @@ class LearnedField:
         own = self._usual_pitch
         if own is not None and pitch_um is not None and self._of_pitch(pitch_um).any():
             own = pitch_um
-        cell = np.round(va.in_units(position, settings) / _CELL)
+        cell = np.round(query.in_units(position, settings) / _CELL)
         steps = tuple(None if np.isnan(step) else float(step) for step in cell)
         rows, memory, kind = self._memory(own, () if len(self._tree(own)[0]) <= NEAREST else steps)
         conditions = Conditions.of(settings, own, kind)

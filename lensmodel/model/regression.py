@@ -48,8 +48,7 @@ from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.numerics import jit, on_simplex
 from lensmodel.core.psf import PsfSample, resized, second_moments
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
-from lensmodel.model import camera_bodies
-from lensmodel.model import query as va
+from lensmodel.model import camera_bodies, query
 from lensmodel.model.bandwidths import bandwidths, cross_validate
 from lensmodel.model.query import PAPER, ModelSettings, Part
 
@@ -75,7 +74,7 @@ class Neighbourhood:
 
     def near(self, positions: Sequence[FieldPosition], settings: LensSettings) -> Answers:
         """Weigh the samples near each of some places."""
-        chosen = [self._weighed(va.point(position, settings)) for position in positions]
+        chosen = [self._weighed(query.point(position, settings)) for position in positions]
         return Answers(
             np.concatenate([rows for rows, _ in chosen]),
             np.concatenate([weights for _, weights in chosen]),
@@ -85,11 +84,11 @@ class Neighbourhood:
     def _weighed(self, asked: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Rows and weights of sum 1 for one question, the least first (eq. 4 and 7)."""
         rows = self.within(asked, _REACH)
-        squared = va.squared_distances(self.points[rows], asked, self.scale)
+        squared = query.squared_distances(self.points[rows], asked, self.scale)
         near = np.flatnonzero((squared <= _REACH**2) & (self.weights[rows] > 0.0))
         if len(near) < _FEW:  # the nearest few, however far
             rows = np.arange(len(self.points))
-            squared = va.squared_distances(self.points, asked, self.scale)
+            squared = query.squared_distances(self.points, asked, self.scale)
             squared[self.weights <= 0.0] = np.inf
             near = np.argsort(squared, kind="stable")[: min(_FEW, np.count_nonzero(self.weights > 0.0))]
         rows, squared = rows[near], squared[near]
@@ -119,22 +118,22 @@ class Regression:
         self.samples = samples
         self._pitch_um = camera_bodies.usual_pitch(samples)  # that all kernels are brought to, or None
         common = camera_bodies.at_pitch(samples, self._pitch_um)
-        points = va.points(common)
+        points = query.points(common)
         self._widths = WidthField() if settings.mode == PAPER else WidthField.fit(common, base)
         self._local = LocalKernels.of(common, points, self._widths)
         self._validation = cross_validate(common, settings, self._local.upright, points, base)
-        self._where = va.all_in_units(common)
+        self._where = query.all_in_units(common)
         # what the estimators expect of their samples; 0 where they expect nothing
         self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
         self._photos = np.array([s.photo for s in samples], dtype=object)
         self.bandwidth = bandwidths(points, settings, self._validation.factors)
-        self._around = Neighbourhood(points, self._validation.weights, va.scales(self.bandwidth))
+        self._around = Neighbourhood(points, self._validation.weights, query.scales(self.bandwidth))
 
     def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:
         """Answer at a place, in pixels of some pitch."""
         near = self._around.near([position], settings)
-        where, asked = self._where[near.rows], va.in_units(position, settings)
-        support = va.Support.of(where, asked)
+        where, asked = self._where[near.rows], query.in_units(position, settings)
+        support = query.Support.of(where, asked)
         outward = math.hypot(*asked[:2]) - float(np.hypot(where[:, 0], where[:, 1]).max())
         return Part(
             self.kernels([position], settings, size, pitch_um)[0],
@@ -149,7 +148,7 @@ class Regression:
     ) -> NDArray[np.float64]:
         """Return the kernels of many places, shape (q, size, size)."""
         near = self._around.near(positions, settings)
-        widths = self._widths.over(np.array([va.point(p, settings) for p in positions]))
+        widths = self._widths.over(np.array([query.point(p, settings) for p in positions]))
         angles = np.array([p.phi for p in positions])
         own = self._pitch_um
         if own is None or pitch_um is None or camera_bodies.alike(own, pitch_um):
@@ -219,7 +218,7 @@ class WidthField:
 
     def _features(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
         r2 = where[:, 0] ** 2
-        x, y = va.vectors(where).T
+        x, y = query.vectors(where).T
         stops, focal = where[:, 3] - self.stops, where[:, 5] - self.focal
         stops[np.isnan(stops)] = focal[np.isnan(focal)] = 0.0
         wave = (where[:, 4] - WAVELENGTH_NM["g"]) / 100.0
@@ -237,7 +236,7 @@ class WidthField:
         if len(rows) > _MOST:
             rows = rows[np.linspace(0, len(rows) - 1, _MOST).round().astype(np.intp)]
         samples = [samples[int(i)] for i in rows]
-        where = va.points(samples)
+        where = query.points(samples)
         known = (column[~np.isnan(column)] for column in (where[:, 3], where[:, 5]))
         stops, focal = (float(np.median(column)) if column.size else 0.0 for column in known)
         origin = cls(stops=stops, focal=focal)

@@ -41,6 +41,7 @@ from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import load_profile, save_profile
 
 HERE = Path(__file__).parents[1]
+PICTURE = np.random.default_rng(0).integers(20, 220, (320, 400, 3), dtype=np.uint8)
 PROFILE = "my-24mm.lensprofile"
 PATIENCE_S = 240.0
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
@@ -110,13 +111,6 @@ def folder(made: Path, tmp_path: Path) -> Iterator[Path]:
     assert not [path for path in tmp_path.rglob("*") if ".part" in path.name]
 
 
-def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
-    rng = np.random.default_rng(0)
-    blocks = np.kron(rng.integers(20, 200, (80, 100, 3)), np.ones((4, 4, 1)))
-    smooth = (blocks + np.roll(blocks, 1, 0) + np.roll(blocks, 1, 1) + np.roll(blocks, (1, 1), (0, 1))) / 4
-    return np.clip(smooth + rng.normal(0, 2, smooth.shape), 0, 255).astype(np.uint8)
-
-
 @pytest.fixture
 def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Learn from two patches of a photo, too few for a wavefront: its fit takes longer than the rest."""
@@ -170,9 +164,7 @@ def test_correct_leaves_what_is_there_alone_unless_forced(folder: Path, here: He
 @pytest.mark.parametrize(
     ("photos", "output", "written"),
     [
-        (["a.dng"], "sharp.tif", ["sharp.tif"]),
         (["a.dng"], "new/sharp.JPG", ["new/sharp.JPG"]),
-        (["a.dng"], "sharp.v2", ["sharp.v2/a-corrected.tif"]),
         (["a.dng"], "sharp.tif/", ["sharp.tif/a-corrected.tif"]),
         (["a.dng"], "there.png", ["there.png/a-corrected.tif"]),
         (["a.dng", "b.dng"], "out.tif", ["out.tif/a-corrected.tif", "out.tif/b-corrected.tif"]),
@@ -192,8 +184,7 @@ def test_a_name_that_ends_as_a_pictures_is_a_file_for_one_photo_and_any_other_a_
 
 SHOTS = {
     "ending in capitals": (["IMG_1.DNG", "img_1.jpg"], ["IMG_1.DNG"]),
-    "phone": (["P.RAW-01.COVER.jpg", "P.RAW-02.ORIGINAL.dng"], ["P.RAW-02.ORIGINAL.dng"]),
-    "phone, other order": (
+    "phone": (
         ["P.RAW-01.MP.COVER.jpg", "P.RAW-02.ORIGINAL.dng", "P2.jpg"],
         ["P.RAW-02.ORIGINAL.dng", "P2.jpg"],
     ),
@@ -262,7 +253,7 @@ def test_folders_pass_over_what_was_made_of_a_raw_file_and_bad_photos_do_not_sto
     folder: Path, here: Here
 ) -> None:
     for name in ("one.jpg", "one.tif", "one-corrected.tif", "two.jpg", "two.png"):
-        Image.fromarray(_picture()).save(folder / name)
+        Image.fromarray(PICTURE).save(folder / name)
     (folder / "a-note.dng").write_text("this is text")
     done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
 
@@ -292,7 +283,7 @@ def test_two_runs_on_one_profile_drop_nothing_of_each_other(
 
 
 def test_a_photo_that_does_not_count_leaves_no_trace(folder: Path, here: Here) -> None:
-    Image.fromarray(_picture()).save(folder / "scan.png")
+    Image.fromarray(PICTURE).save(folder / "scan.png")
     done = here("calibrate", "scan.png", "-p", "no/such/lens.lensprofile")
 
     assert done.returncode == 1
@@ -332,14 +323,13 @@ REFUSED = {
     "folder of profiles": ((*CORRECT, "-p", "empty"), 2, "empty is a folder; give the file"),
     "output is a file": (("correct", "one.dng", "-p", PROFILE, "-o", "bad"), 2, "bad is a file"),
     "halo that is none": ((*CORRECT, "-p", PROFILE, "--halo", "nan"), 2, "halo must not be negative.*nan"),
-    "a name of another format": (
-        ("correct", "one.dng", "-p", PROFILE, "-o", "o.png", "--format", "jpeg"),
+    "other format": (
+        (*CORRECT[:-1], "o.png", "--format", "jpeg", "-p", PROFILE),
         2,
-        "o.png is no name for --format jpeg; end it in .jpg",
+        "no name .*end it in .jpg",
     ),
     "unknown method": ((*CORRECT, "-p", PROFILE, "--method", "x"), 2, "known: .*fast"),
     "unknown estimator": ((*CALIBRATE, "-p", "new", "--estimator", "x"), 2, "known: .*michaeli-irani"),
-    "unknown selector": ((*CALIBRATE, "-p", "new", "--selector", "best"), 2, "known: .*good-regions"),
     "aperture": ((*CALIBRATE, "-p", "new", "--aperture", "-2"), 2, "-2"),
     "aperture in words": (("report", PROFILE, "--aperture", "wide"), 2, "such as 2.8 or f/2.8, got 'wide'"),
     "even size": (("export", PROFILE, "-o", "new.npz", "--size", "20"), 2, "must be odd, got 20"),
@@ -348,8 +338,6 @@ REFUSED = {
     "photos to blur": (("bench", "blind", "--photos", "empty", "-o", "o"), 2, "empty holds no PNG, JPEG"),
     "no such picture": (("bench", "gallery", "--only", "rose", "-o", "o"), 2, "no picture is called 'rose'"),
     "part to time": (("bench", "correct", "--roi", "1,2,x,4"), 2, "whole numbers T,L,H,W, got '1,2,x,4'"),
-    "report there": (("report", PROFILE, "-o", "reported"), 2, "report.csv is there already; --force"),
-    "report of nothing": (("report", "gone"), 2, "no lens profile at gone; make it"),
     "export by no format": (("export", PROFILE, "-o", "new.bmp"), 2, "ends in .fits, .json"),
     "half a place": (("export", PROFILE, "-o", "new.npz", "--phi", "1"), 2, "--phi needs --r"),
     "demo into a file": (("demo", "-o", "bad"), 2, "bad is a file"),
@@ -368,8 +356,6 @@ def test_refusal_is_one_sentence_with_the_value_and_a_remedy(
     (folder / "text.dng").write_text("no picture at all")
     (folder / "bad").write_bytes((folder / PROFILE).read_bytes()[:-200])
     (folder / "there.npy").write_bytes(b"mine")
-    (folder / "reported").mkdir()
-    (folder / "reported" / "report.csv").write_bytes(b"mine")
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
     done = here(*words)
@@ -511,7 +497,7 @@ def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
 
 
 def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:
-    Image.fromarray(_picture()).save(folder / "scan.tif")
+    Image.fromarray(PICTURE).save(folder / "scan.tif")
     done = here("correct", "scan.tif", "-p", PROFILE, "-o", "out", "--method", "fast")
 
     assert done.returncode == 0
@@ -591,53 +577,29 @@ def test_stopped_correction_leaves_whole_files_only_and_goes_on(folder: Path, ma
 # --- progress ----------------------------------------------------------------------------------
 
 
-Seen = Callable[..., tuple[str, str]]
-
-
-@pytest.fixture
-def on_a_terminal(here: Here, monkeypatch: pytest.MonkeyPatch) -> Seen:
-    """Run `main` with a terminal for standard error; return what each of the two outputs got."""
-
-    def run(*words: str) -> tuple[str, str]:
-        ours, theirs = pty.openpty()
-        seen: list[bytes] = []
-        reader = threading.Thread(target=lambda: seen.extend(iter(partial(_read, ours), b"")))
-        reader.start()
-        monkeypatch.setenv("TERM", "xterm")
-        monkeypatch.setenv("COLUMNS", "120")
-        with os.fdopen(theirs, "w") as terminal:
-            said = here(*words, terminal=terminal).stdout
-        reader.join()
-        os.close(ours)
-        return said, b"".join(seen).decode()
-
-    return run
-
-
+@pytest.mark.parametrize(
+    ("words", "written", "told"),
+    [
+        (("correct", "one.dng", "-o", "out.tif", "--method", "fast"), "out.tif", "one.dng"),
+        (("export", PROFILE, "-o", "new.npz", "--size", "15"), "new.npz", "computing its PSFs"),
+    ],
+)
 def test_progress_is_on_a_terminal_and_results_are_in_the_pipe(
-    on_a_terminal: Seen,
+    words: tuple[str, ...], written: str, told: str, here: Here, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said, seen = on_a_terminal("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
+    ours, theirs = pty.openpty()
+    seen: list[bytes] = []
+    reader = threading.Thread(target=lambda: seen.extend(iter(partial(_read, ours), b"")))
+    reader.start()
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    with os.fdopen(theirs, "w") as terminal:
+        said = here(*words, *(("-p", PROFILE) if words[0] == "correct" else ()), terminal=terminal).stdout
+    reader.join()
+    os.close(ours)
 
-    assert said.splitlines() == [str(Path("out/one-corrected.tif"))]
-    assert "one.dng" in seen
-
-
-@pytest.mark.slow
-def test_a_benchmark_of_the_lens_model_says_how_far_it_is(on_a_terminal: Seen) -> None:
-    said, seen = on_a_terminal(
-        "bench", "model", "--seeds", "1000:1003", "--photos", "1", "--methods", "eff-linear"
-    )
-
-    assert said.startswith("| method |")
-    assert "100%" in seen
-
-
-def test_a_question_to_the_lens_says_that_it_is_being_answered(on_a_terminal: Seen) -> None:
-    said, seen = on_a_terminal("export", PROFILE, "-o", "new.npz", "--size", "15")
-
-    assert said.splitlines() == ["new.npz"]
-    assert "computing its PSFs" in seen
+    assert said.splitlines() == [written]
+    assert told in b"".join(seen).decode()
 
 
 def _read(terminal: int) -> bytes:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from running import SMALL, write_photo
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 import lensmodel
 from lensmodel.blind import sampling
@@ -66,6 +66,10 @@ def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_photo(tmp_path_factory.mktemp("photos") / "one.dng", 1, shape=SMALL)
 
 
+def calibrate(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, ["calibrate", *map(str, words)])
+
+
 def stacked(samples: list[PsfSample]) -> np.ndarray:
     return np.stack([sample.kernel for sample in samples])
 
@@ -102,20 +106,17 @@ def test_a_cluster_of_two_processes_calibrates_the_same_profile(tmp_path: Path) 
         pytest.skip("Dask is not installed: pip install 'lensmodel[cluster]'")
     from distributed import LocalCluster  # noqa: PLC0415 - an extra
 
-    for k in range(4):
-        write_photo(tmp_path / f"{k}.dng", k)
-    common = [str(tmp_path / f"{k}.dng") for k in range(4)] + ["--estimator", "default", "--quiet"]
+    photos, quick = (
+        [write_photo(tmp_path / f"{k}.dng", k) for k in range(4)],
+        ["--estimator", "default", "-q"],
+    )
     with LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp"
     ) as cluster:
         address = cluster.scheduler_address
-        far = CliRunner().invoke(
-            app,
-            ["calibrate", *common, "--profile", str(tmp_path / "far.lensprofile"), "--scheduler", address],
-        )
-        nodes = cluster.scheduler_info["workers"]
-        assert len(nodes) == 2
-    near = CliRunner().invoke(app, ["calibrate", *common, "--profile", str(tmp_path / "near.lensprofile")])
+        far = calibrate(*photos, *quick, "-p", tmp_path / "far.lensprofile", "--scheduler", address)
+        assert len(cluster.scheduler_info["workers"]) == 2
+    near = calibrate(*photos, *quick, "-p", tmp_path / "near.lensprofile")
 
     assert (far.exit_code, near.exit_code) == (0, 0), far.output + near.output
     one, other = (load_profile(tmp_path / f"{name}.lensprofile").model for name in ("far", "near"))
@@ -128,16 +129,6 @@ def test_a_cluster_that_does_not_answer_is_said(
     pytest.importorskip("distributed")
     monkeypatch.setattr("lensmodel.cli.calibrate.CONNECT_S", 0.5)
 
-    result = CliRunner().invoke(
-        app,
-        [
-            "calibrate",
-            str(photo),
-            "--profile",
-            str(tmp_path / "x.lensprofile"),
-            "--scheduler",
-            "tcp://127.0.0.1:9",
-        ],
-    )
+    result = calibrate(photo, "-p", tmp_path / "x.lensprofile", "--scheduler", "tcp://127.0.0.1:9")
 
     assert "no cluster answers there" in str(result.exception)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -52,9 +53,7 @@ def board_scene(square_px: float, shape: tuple[int, int], setup: targets.Setup) 
     return np.ascontiguousarray(np.broadcast_to(plane.astype(np.float32), (3, *plane.shape)))
 
 
-def light_scene(
-    spacing: int, shape: tuple[int, int], rng: np.random.Generator, *, faint: float = 0.25
-) -> np.ndarray:
+def light_scene(spacing: int, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     """Draw points of light anywhere between pixels, of different brightness, over a dark sky.
 
     A point between pixels is the sinc that a point is to whoever sees no finer than pixels. Its lobes are
@@ -64,16 +63,13 @@ def light_scene(
     plane = np.zeros((height, width))
     step_r = np.arange(targets.MARGIN + spacing // 2, height - targets.MARGIN - spacing // 4, spacing)
     step_c = np.arange(targets.MARGIN + spacing // 2, width - targets.MARGIN - spacing // 4, spacing)
-    for row in step_r:
-        for col in step_c:
-            r, c = np.array([row, col]) + rng.uniform(-0.15, 0.15, 2) * spacing
-            flux = faint * 10.0 ** rng.uniform(0.0, 0.7)
-            reach = 24
-            top, left = round(r) - reach, round(c) - reach
-            t = np.arange(2 * reach + 1)
-            taper = np.cos(np.linspace(-np.pi / 2, np.pi / 2, 2 * reach + 1)) ** 0.5
-            lobe_r, lobe_c = np.sinc(t + top - r) * taper, np.sinc(t + left - c) * taper
-            plane[top : top + 2 * reach + 1, left : left + 2 * reach + 1] += flux * np.outer(lobe_r, lobe_c)
+    t = np.arange(-24, 25)
+    taper = np.cos(np.linspace(-np.pi / 2, np.pi / 2, 49)) ** 0.5
+    for place in itertools.product(step_r, step_c):
+        r, c = place + rng.uniform(-0.15, 0.15, 2) * spacing
+        flux = 0.25 * 10.0 ** rng.uniform(0.0, 0.7)
+        rows, cols = t + round(r), t + round(c)
+        plane[np.ix_(rows, cols)] += flux * np.outer(np.sinc(rows - r) * taper, np.sinc(cols - c) * taper)
     plane += 0.003  # a night sky over a suburb
     return np.ascontiguousarray(np.broadcast_to(plane.astype(np.float32), (3, *plane.shape)))
 
@@ -89,6 +85,11 @@ def moved_scene(scene: np.ndarray, shift: tuple[float, float], turn_deg: float) 
         for plane in scene
     ]
     return np.ascontiguousarray(np.maximum(np.stack(planes), 0.0))
+
+
+def grey_photo(aperture: float | None = 2.0) -> LinearPhoto:
+    grey = np.full([n + 2 * targets.MARGIN for n in SHAPE], 0.4)
+    return photo_of(grey, lopsided(), aperture=aperture)
 
 
 def lopsided() -> Kernel:
@@ -111,9 +112,8 @@ def photo_of(
 ) -> LinearPhoto:
     """One Bayer photo of a scene with its margin."""
     rng = np.random.default_rng(seed)
-    blurred = signal.fftconvolve(scene, kernel, mode="same")[
-        targets.MARGIN : -targets.MARGIN, targets.MARGIN : -targets.MARGIN
-    ]
+    inner = slice(targets.MARGIN, -targets.MARGIN)
+    blurred = signal.fftconvolve(scene, kernel, mode="same")[inner, inner]
     noisy = blurred + rng.standard_normal(blurred.shape) * np.sqrt(NOISE.variance(blurred))
     plane = np.clip(noisy, 0.0, 1.0).astype(np.float32)
     height, width = plane.shape
@@ -195,9 +195,8 @@ def test_a_target_is_written_to_print_in_the_middle_of_its_paper(tmp_path: Path,
     assert [float(side) for side in box.groups()] == pytest.approx(
         [side / 25.4 * 72 for side in PAPERS[paper]], rel=0.01
     )
-    assert (
-        f"lensmodel target, detail 300, {paper.upper()}".encode("utf-16-be") in data
-    )  # as printing names it
+    title = f"lensmodel target, detail 300, {paper.upper()}"  # as printing names it
+    assert title.encode("utf-16-be") in data
     start = data.index(b"stream\n", data.index(b"/DCTDecode")) + len(b"stream\n")
     with Image.open(io.BytesIO(data[start:])) as picture:
         greys = np.asarray(picture, dtype=float) / 255.0
@@ -317,9 +316,8 @@ def test_a_target_is_found_and_gives_the_kernel_as_it_is(
 
 
 def test_a_photo_without_a_target_is_refused() -> None:
-    grey = np.full((SHAPE[0] + 2 * targets.MARGIN, SHAPE[1] + 2 * targets.MARGIN), 0.4)
     with pytest.raises(NotEnoughEvidenceError, match="corner discs"):
-        Target(details=(500,)).measure([photo_of(grey, lopsided())], size=21)
+        Target(details=(500,)).measure([grey_photo()], size=21)
 
 
 def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
@@ -330,9 +328,8 @@ def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
     assert len(found) == 4
     assert max(errors) < 0.06
     lit = Points(across=2, down=2).measure([photo_of(scene + 0.27, lopsided())], size=21, channels=("g",))
-    assert (
-        max(distance(one.kernel, lopsided()).rel_l2 for one in lit) < 0.15
-    )  # 100 times the light of the sky
+    # 100 times the light of the sky
+    assert max(distance(one.kernel, lopsided()).rel_l2 for one in lit) < 0.15
     assert min(one.error for one in lit) > max(one.error for one in found)
     bright = photo_of(40.0 * scene, lopsided())
     with pytest.raises(NotEnoughEvidenceError, match="expose less"):
@@ -438,15 +435,15 @@ def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
     assert error_of_pair(pair, 104) < 0.1
 
 
-def test_a_pair_of_one_aperture_is_refused() -> None:
-    grey = np.full((SHAPE[0] + 2 * targets.MARGIN, SHAPE[1] + 2 * targets.MARGIN), 0.4)
-    photo = photo_of(grey, lopsided())
-    with pytest.raises(InvalidInputError, match="two stops"):
-        AperturePair().measure([photo, photo], size=21)
-    with pytest.raises(InvalidInputError, match="takes 2 photos"):
-        AperturePair().measure([photo], size=21)
-    with pytest.raises(InvalidInputError, match="an odd side of 3 pixels or more, got 20"):
-        AperturePair().measure([photo, photo], size=20)
+@pytest.mark.parametrize(
+    ("photos", "size", "said"),
+    [(2, 21, "two stops"), (1, 21, "takes 2 photos"), (2, 20, "an odd side .* got 20")],
+)
+def test_a_pair_of_one_aperture_one_photo_and_even_sizes_are_refused(
+    photos: int, size: int, said: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=said):
+        AperturePair().measure([grey_photo()] * photos, size=size)
 
 
 @pytest.mark.parametrize("covariance", [[[3.0, 0.0], [0.0, 0.8]], [[1.9, 1.1], [1.1, 1.9]]])
@@ -478,17 +475,11 @@ def test_measured_samples_join_or_replace_blind_ones(target_photo: LinearPhoto) 
         resized(lopsided(), 11), target_photo.frame.position(100, 100), "g", 0.04, (100.0, 100.0), 144
     )
     method = measure.methods.create("target")
-    blind = [
-        sample
-        for f_number, photo in ((2.0, "old"), (5.6, "other"))
-        for sample in measure.samples_of(
-            [place], method, target_photo, photo_id=photo, settings=LensSettings(aperture=f_number)
-        )
-    ]
-    blind = [replace(sample, estimator="blind/1") for sample in blind]
-    samples = measure.samples_of(
-        [place], method, target_photo, photo_id="new", settings=LensSettings(aperture=2.0)
+    old, other, samples = (
+        measure.samples_of([place], method, target_photo, photo_id=photo, settings=LensSettings(aperture=n))
+        for n, photo in ((2.0, "old"), (5.6, "other"), (2.0, "new"))
     )
+    blind = [replace(sample, estimator="blind/1") for sample in (*old, *other)]
     assert samples[0].estimator == "measured-target/1"
     assert samples[0].measured
     model = LensModel.fit(blind)
@@ -497,7 +488,6 @@ def test_measured_samples_join_or_replace_blind_ones(target_photo: LinearPhoto) 
     assert resized(samples[0].kernel, 21).shape == (21, 21)
 
 
-def test_a_measurement_needs_an_aperture(target_photo: LinearPhoto) -> None:
-    grey = np.full((SHAPE[0] + 2 * targets.MARGIN, SHAPE[1] + 2 * targets.MARGIN), 0.4)
+def test_a_measurement_needs_an_aperture() -> None:
     with pytest.raises(Exception, match="aperture"):
-        measure.samples_of_developed("target", [photo_of(grey, lopsided(), aperture=None)], photo_id="x")
+        measure.samples_of_developed("target", [grey_photo(aperture=None)], photo_id="x")

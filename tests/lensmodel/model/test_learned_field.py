@@ -75,16 +75,9 @@ def photo(name: str, seed: int, width: float = 2.0, count: int = 48, **more: Any
     for r, phi in zip(np.sqrt(rng.random(count)), rng.uniform(-3.1, 3.1, count), strict=True):
         patch = EncodedPatch(np.full(9, width, np.float16), np.full(TOKEN_LENGTH, width, np.float16))
         for channel in CHANNELS:
-            sample = PsfSample(
-                gaussian(15, width**2 * np.eye(2)),
-                FieldPosition(float(r), float(phi)),
-                F2.with_channel(channel),
-                photo=name,
-                estimator="default/small",
-                encoded=patch,
-                error=0.3,
-            )
-            samples.append(replace(sample, **more))
+            kernel, place = gaussian(15, width**2 * np.eye(2)), FieldPosition(float(r), float(phi))
+            told = {"photo": name, "estimator": "default/small", "encoded": patch, "error": 0.3} | more
+            samples.append(PsfSample(kernel, place, F2.with_channel(channel), **told))
     return samples
 
 

@@ -106,10 +106,3 @@ def test_a_photo_of_another_body_joins_by_its_pitch(both: list[PsfSample]) -> No
 def test_impossible_pitches_are_refused(both: list[PsfSample], bad: float) -> None:
     with pytest.raises(InvalidInputError, match="pitch"):
         LensModel.fit(both).query(ASKED[0], SETTINGS, 21, pitch_um=bad)
-
-
-def test_a_sample_of_impossible_pixels_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match="pixel pitch"):
-        replace(photo("a", 0, FINE_UM)[0], pixel_pitch_um=0.0)
-    with pytest.raises(InvalidInputError, match="half diagonal"):
-        replace(photo("a", 0, FINE_UM)[0], half_diagonal_px=0.0)

@@ -29,12 +29,8 @@ GREEN = LensSettings(aperture=2.0)
 @st.composite
 def patches(draw: st.DrawFn) -> EncodedPatch:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    statistics, token = rng.normal(size=9), rng.normal(size=TOKEN_LENGTH)
-    return EncodedPatch(
-        statistics.astype(np.float16),
-        token.astype(np.float16),
-        draw(st.sampled_from(("raw", "tiff", "jpeg"))),
-    )
+    statistics, token = (rng.normal(size=n).astype(np.float16) for n in (9, TOKEN_LENGTH))
+    return EncodedPatch(statistics, token, draw(st.sampled_from(("raw", "tiff", "jpeg"))))
 
 
 @st.composite
@@ -95,19 +91,18 @@ def test_the_channels_of_a_patch_share_what_it_encodes() -> None:
     assert back[0].encoded is back[1].encoded is back[2].encoded
 
 
-@pytest.mark.parametrize("size", [0, 2, 7, -3])
-def test_a_side_that_does_not_fit_is_refused(size: int) -> None:
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        *(({"size": side}, "kernels of side") for side in (0, 2, 7, -3)),
+        *(({"encoded": patch}, "encoded patch") for patch in (3, -1, "0")),
+        ({"weight": 2.0}, "weight"),
+    ],
+)
+def test_entries_that_do_not_fit_are_refused(change: dict[str, object], said: str) -> None:
     packed = pack_samples([PsfSample(delta(5), FieldPosition(0.5, 0.0))])
 
-    with pytest.raises(ValueError, match="kernels of side"):
-        unpack_samples(replace(packed, entries=[{**packed.entries[0], "size": size}]))
-
-
-@pytest.mark.parametrize("change", [{"encoded": 3}, {"encoded": -1}, {"encoded": "0"}])
-def test_patches_that_are_not_there_are_refused(change: dict[str, object]) -> None:
-    packed = pack_samples([PsfSample(delta(5), FieldPosition(0.5, 0.0))])
-
-    with pytest.raises(ValueError, match="encoded patch"):
+    with pytest.raises((ValueError, InvalidInputError), match=said):
         unpack_samples(replace(packed, entries=[{**packed.entries[0], **change}]))
 
 
@@ -117,13 +112,6 @@ def test_patches_that_are_not_there_are_refused(change: dict[str, object]) -> No
 def test_other_bytes_are_no_encoded_patch(data: bytes) -> None:
     with pytest.raises(InvalidInputError):
         EncodedPatch.from_bytes(data)
-
-
-def test_values_out_of_range_are_refused() -> None:
-    packed = pack_samples([PsfSample(delta(5), FieldPosition(0.5, 0.0))])
-
-    with pytest.raises(InvalidInputError, match="weight"):
-        unpack_samples(replace(packed, entries=[{**packed.entries[0], "weight": 2.0}]))
 
 
 @cache

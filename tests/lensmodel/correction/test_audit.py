@@ -72,14 +72,8 @@ def kept(
     return kept_shares(photo, made.astype(np.float32), blurs, sensors, [error] * 3, inner)
 
 
-def share_of(
-    check: str,
-    made: Planes,
-    photo: Planes | None = None,
-    kernel: NDArray[np.float64] | None = KERNEL,
-    **known: Any,
-) -> float:
-    return kept(PHOTO if photo is None else photo, made, kernel, **known)[1][check]
+def share_of(check: str, made: Planes, photo: Planes | None = None, *kernel: Any, **known: Any) -> float:
+    return kept(PHOTO if photo is None else photo, made, *kernel, **known)[1][check]
 
 
 LIGHT = scene()
@@ -107,10 +101,8 @@ def test_what_is_kept_is_a_share(seed: int) -> None:
 
     keep, checks = kept(before, after, None)
 
-    assert keep.shape == (40, 37)
-    assert keep.dtype == np.float32
-    assert keep.min() >= 0.0
-    assert keep.max() <= 1.0
+    assert (keep.shape, keep.dtype) == ((40, 37), np.float32)
+    assert 0.0 <= keep.min() <= keep.max() <= 1.0
     assert set(checks) == set(LIMITS) - {"re-blur"}  # no PSF is known
 
 

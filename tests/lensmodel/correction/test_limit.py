@@ -27,6 +27,16 @@ def grey(plane: np.ndarray) -> Planes:
     return np.stack([plane] * 3).astype(np.float32)
 
 
+def even(*colour: float, side: int = 16) -> Planes:
+    return np.full((side, side, 3), colour, dtype=np.float32).transpose(2, 0, 1).copy()
+
+
+def nearby(photo: Planes) -> tuple[Planes, Planes]:
+    """The least and the greatest value within two pixels."""
+    window = (1, 5, 5)
+    return tuple(f(photo, window, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+
+
 def blurred(plane: np.ndarray) -> Planes:
     return grey(ndimage.gaussian_filter(plane, 1.5, mode="nearest"))
 
@@ -37,14 +47,10 @@ def step() -> np.ndarray:
     return plane
 
 
-def as_seen(light: np.ndarray) -> np.ndarray:
-    return np.asarray(np.maximum(light, 0.0) ** (1 / 2.2))
-
-
 def overshoot(made: Planes) -> float:
     """How far a plane leaves the levels of `step`, as a share of it as seen."""
-    low, high = as_seen(np.array([0.1, 0.6]))
-    shown = as_seen(made[1, 12:-12, 12:-12])
+    low, high = np.array([0.1, 0.6]) ** (1 / 2.2)
+    shown = np.maximum(made[1, 12:-12, 12:-12], 0.0) ** (1 / 2.2)
     return float(max(shown.max() - high, low - shown.min()) / (high - low))
 
 
@@ -102,8 +108,7 @@ def test_beside_clipped_light_nothing_leaves_the_range_nearby() -> None:
     result = held(photo, made, UNSURE)
 
     near = ndimage.binary_dilation(photo[0] >= 1.0, iterations=3)
-    window = (1, 5, 5)
-    low, high = ndimage.minimum_filter(photo, window), ndimage.maximum_filter(photo, window)
+    low, high = nearby(photo)
     assert (result >= low - 1e-5)[:, near].all()
     assert (result <= high + 1e-5)[:, near & (photo[0] < 1.0)].all()
 
@@ -122,7 +127,7 @@ def test_around_a_white_area_no_pixel_gets_brighter_or_darker_than_all_nearby(er
     ring = (photo[1] < 1.0) & (photo[1] > 0.5)
     darker, brighter = (np.where(ring, np.float32(level), photo).astype(np.float32) for level in (0.0, 1.0))
 
-    assert (held(photo, darker, error) >= ndimage.minimum_filter(photo, (1, 5, 5)) - 1e-5).all()
+    assert (held(photo, darker, error) >= nearby(photo)[0] - 1e-5).all()
     assert (held(photo, brighter, error) <= photo + 1e-5).all()
 
 
@@ -165,8 +170,7 @@ def test_beside_a_lamp_that_blur_kept_below_clipping_no_pixel_gets_darker_than_a
 def test_a_halo_that_was_chosen_bounds_every_colour(halo: float) -> None:
     rng = np.random.default_rng(1)
     photo, made = (rng.uniform(low, high, (3, 30, 40)).astype(np.float32) for low, high in ((0, 1), (-1, 2)))
-    window = (1, 5, 5)
-    low, high = (f(photo, window, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+    low, high = nearby(photo)
 
     result = held(photo, made, SURE, halo)
 
@@ -198,15 +202,14 @@ def test_no_hue_leaves_those_nearby_and_the_light_stays(
         differences(planes, share * brightest)
         for planes, share in ((photo, 0.05), (photo, grey), (result, grey))
     )
-    window = (1, 5, 5)
-    low, high = (f(lent, window, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+    low, high = nearby(lent)
     low, high = np.minimum(low, own), np.maximum(high, own)
     assert (after >= low - purer - 0.002).all()
     assert (after <= high + purer + 0.002).all()
 
 
 def test_a_dark_speck_lends_no_colour_to_the_light_beside_it() -> None:
-    photo = np.full((3, 16, 16), 0.3, dtype=np.float32)
+    photo = even(0.3, 0.3, 0.3)
     photo[:, 8, 10] = (0.001, 0.001, 0.008)
     made = photo.copy()
     made[:, 8, 8] = (0.15, 0.15, 0.6)
@@ -219,8 +222,7 @@ def test_a_dark_speck_lends_no_colour_to_the_light_beside_it() -> None:
 
 def test_noise_of_a_colour_that_is_nearly_absent_stays_small() -> None:
     """Yellow petals: their blue has next to no light, and a speck of it shows."""
-    photo = np.empty((3, 24, 24), dtype=np.float32)
-    photo[:] = np.array([0.25, 0.6, 0.001], dtype=np.float32)[:, None, None]
+    photo = even(0.25, 0.6, 0.001, side=24)
     made = photo.copy()
     made[2, 12, 12] = 0.04
 
@@ -250,7 +252,7 @@ def test_a_black_letter_on_white_gets_no_green() -> None:
 
 
 def test_a_colour_may_get_purer_where_the_kernel_is_sure() -> None:
-    photo = np.full((3, 16, 16), 0.3, dtype=np.float32)
+    photo = even(0.3, 0.3, 0.3)
     made = photo.copy()
     made[:, 8, 8] = (0.315, 0.3, 0.285)
 
@@ -262,8 +264,7 @@ def test_a_colour_may_get_purer_where_the_kernel_is_sure() -> None:
 
 def test_two_hues_of_the_surroundings_do_not_allow_a_third() -> None:
     """Brown beside grey: each colour's share of purple is within the range of theirs, purple is not."""
-    photo = np.empty((3, 16, 16), dtype=np.float32)
-    photo[:, :, :8] = np.array([0.33, 0.20, 0.09], dtype=np.float32)[:, None, None]
+    photo = even(0.33, 0.20, 0.09)
     photo[:, :, 8:] = 0.4
     made = photo.copy()
     made[:, 8, 8] = (0.5, 0.25, 0.45)
@@ -274,8 +275,7 @@ def test_two_hues_of_the_surroundings_do_not_allow_a_third() -> None:
 
 
 def test_white_that_is_no_longer_clipped_takes_the_hue_around_it() -> None:
-    photo = np.empty((3, 20, 20), dtype=np.float32)
-    photo[:] = np.array([0.5, 0.3, 0.1], dtype=np.float32)[:, None, None]
+    photo = even(0.5, 0.3, 0.1, side=20)
     photo[:, 9:11, 9:11] = 1.0
     made = photo.copy()
     made[:, 9, 9] = (0.5, 0.6, 0.9)

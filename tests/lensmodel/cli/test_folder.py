@@ -46,12 +46,10 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (photos / "day 2").mkdir()
     shutil.copy(photos / "a.dng", photos / "day 2")
     known = {photo_id(photos / name): name for name in ("a.dng", "b.dng")}
-    camera = Camera("Test", "T-1", None)
-    lenses = here / "lenses"
-    lenses.mkdir()
-    group = groups([Shot.of(photos / "a.dng")])[0]
-    profile = replace(lens_of_one_blur(), photos=known, cameras=(camera,))
-    save_profile(lenses / f"{group.name}.lensprofile", profile)
+    (here / "lenses").mkdir()
+    (group,) = groups([Shot.of(photos / "a.dng")])
+    profile = replace(lens_of_one_blur(), photos=known, cameras=(Camera("Test", "T-1", None),))
+    save_profile(here / "lenses" / f"{group.name}.lensprofile", profile)
     return here
 
 
@@ -103,13 +101,12 @@ def test_what_cannot_be_read_is_named_and_the_rest_goes_on(journey: Path) -> Non
 
 
 def test_a_group_names_every_body_and_none_that_another_photo_names(tmp_path: Path) -> None:
-    one, two = tmp_path / "one.jpg", tmp_path / "two.jpg"
-    Image.new("RGB", (64, 48)).save(one, exif=Image.Exif())
     exif = Image.Exif()
-    exif[271] = "Maker Only"
-    Image.new("RGB", (64, 48)).save(two, exif=exif)
+    for name in ("one.jpg", "two.jpg"):
+        Image.new("RGB", (64, 48)).save(tmp_path / name, exif=exif)
+        exif[271] = "Maker Only"
 
-    (group,) = groups([Shot.of(two), Shot.of(one)])
+    (group,) = groups([Shot.of(tmp_path / "two.jpg"), Shot.of(tmp_path / "one.jpg")])
 
     assert set(group.camera.split(", ")) == {"unknown camera", "Maker Only"}
 
@@ -149,8 +146,7 @@ def test_the_same_command_again_does_nothing_twice(journey: Path) -> None:
 
 
 def test_quiet_says_nothing_but_errors_and_verbose_tells_of_each_photo(journey: Path) -> None:
-    quiet = lensmodel(*AUTO, "-q", cwd=journey)
-    verbose = lensmodel(*AUTO, "-v", cwd=journey)
+    quiet, verbose = (lensmodel(*AUTO, option, cwd=journey) for option in ("-q", "-v"))
 
     assert quiet.stdout == ""
     assert len(quiet.stderr.splitlines()) == 1

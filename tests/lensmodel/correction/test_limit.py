@@ -23,6 +23,19 @@ def held(photo: Planes, made: Planes, error: float, halo: float | None = None) -
     return limited(photo, made, [BLUR] * 3, [SENSOR] * 3, [error] * 3, halo)
 
 
+def held_pixel(
+    photo: Planes,
+    at: tuple[int, int],
+    made: tuple[float, float, float],
+    error: float,
+    halo: float | None = None,
+) -> np.ndarray:
+    """What is left of one pixel that a correction made."""
+    planes = photo.copy()
+    planes[:, *at] = made
+    return held(photo, planes, error, halo)[:, *at]
+
+
 def grey(plane: np.ndarray) -> Planes:
     return np.stack([plane] * 3).astype(np.float32)
 
@@ -211,10 +224,8 @@ def test_no_hue_leaves_those_nearby_and_the_light_stays(
 def test_a_dark_speck_lends_no_colour_to_the_light_beside_it() -> None:
     photo = even(0.3, 0.3, 0.3)
     photo[:, 8, 10] = (0.001, 0.001, 0.008)
-    made = photo.copy()
-    made[:, 8, 8] = (0.15, 0.15, 0.6)
 
-    result = held(photo, made, SURE, np.inf)[:, 8, 8]
+    result = held_pixel(photo, (8, 8), (0.15, 0.15, 0.6), SURE, np.inf)
 
     np.testing.assert_allclose(result / result.sum(), 1.0 / 3.0, atol=0.12)  # the speck's is .8
     assert result.sum() == pytest.approx(0.9, rel=1e-3)
@@ -223,42 +234,34 @@ def test_a_dark_speck_lends_no_colour_to_the_light_beside_it() -> None:
 def test_noise_of_a_colour_that_is_nearly_absent_stays_small() -> None:
     """Yellow petals: their blue has next to no light, and a speck of it shows."""
     photo = even(0.25, 0.6, 0.001, side=24)
-    made = photo.copy()
-    made[2, 12, 12] = 0.04
 
-    assert held(photo, made, UNSURE)[2, 12, 12] < 0.005
+    assert held_pixel(photo, (12, 12), (0.25, 0.6, 0.04), UNSURE)[2] < 0.005
 
 
 def test_a_pixel_inside_white_gets_no_darker_however_near_its_rim() -> None:
-    photo = np.full((3, 48, 48), 0.05, dtype=np.float32)
+    photo = even(0.05, 0.05, 0.05, side=48)
     photo[:, 20:25, 20:25] = 1.0
     photo[:, 21, 22] = 0.985  # sensors do not clip at one level
-    made = photo.copy()
-    made[:, 21, 22] = (0.7, 1.0, 1.0)
 
-    assert held(photo, made, UNSURE)[0, 21, 22] >= 0.985
+    assert held_pixel(photo, (21, 22), (0.7, 1.0, 1.0), UNSURE)[0] >= 0.985
 
 
 def test_a_black_letter_on_white_gets_no_green() -> None:
-    photo = np.full((3, 24, 24), 0.8, dtype=np.float32)
+    photo = even(0.8, 0.8, 0.8, side=24)
     photo[:, 8:16, 10:13] = 0.03
     photo[1, 11, 10], photo[0, 13, 12] = 0.045, 0.04
-    made = photo.copy()
-    made[:, 12, 11] = (0.0001, 0.03, 0.0005)
 
-    r, g, b = held(photo, made, UNSURE)[:, 12, 11]
+    r, g, b = held_pixel(photo, (12, 11), (0.0001, 0.03, 0.0005), UNSURE)
 
     assert g - min(r, b) < 0.01
 
 
 def test_a_colour_may_get_purer_where_the_kernel_is_sure() -> None:
-    photo = even(0.3, 0.3, 0.3)
-    made = photo.copy()
-    made[:, 8, 8] = (0.315, 0.3, 0.285)
+    photo, purer = even(0.3, 0.3, 0.3), (0.315, 0.3, 0.285)
 
-    sure, unsure = (held(photo, made, error, np.inf)[:, 8, 8] for error in (SURE, UNSURE))
+    sure, unsure = (held_pixel(photo, (8, 8), purer, error, np.inf) for error in (SURE, UNSURE))
 
-    np.testing.assert_allclose(sure, made[:, 8, 8], atol=1e-4)
+    np.testing.assert_allclose(sure, purer, atol=1e-4)
     assert unsure[0] - unsure[2] < 0.011  # .01 of the light's .9, and a little for the grey that is added
 
 
@@ -266,10 +269,8 @@ def test_two_hues_of_the_surroundings_do_not_allow_a_third() -> None:
     """Brown beside grey: each colour's share of purple is within the range of theirs, purple is not."""
     photo = even(0.33, 0.20, 0.09)
     photo[:, :, 8:] = 0.4
-    made = photo.copy()
-    made[:, 8, 8] = (0.5, 0.25, 0.45)
 
-    r, g, b = held(photo, made, SURE, np.inf)[:, 8, 8]
+    r, g, b = held_pixel(photo, (8, 8), (0.5, 0.25, 0.45), SURE, np.inf)
 
     assert g > min(r, b) - 0.05 * (r + g + b)
 
@@ -277,10 +278,8 @@ def test_two_hues_of_the_surroundings_do_not_allow_a_third() -> None:
 def test_white_that_is_no_longer_clipped_takes_the_hue_around_it() -> None:
     photo = even(0.5, 0.3, 0.1, side=20)
     photo[:, 9:11, 9:11] = 1.0
-    made = photo.copy()
-    made[:, 9, 9] = (0.5, 0.6, 0.9)
 
-    r, g, b = held(photo, made, SURE)[:, 9, 9]
+    r, g, b = held_pixel(photo, (9, 9), (0.5, 0.6, 0.9), SURE)
 
     assert r > g > b
 

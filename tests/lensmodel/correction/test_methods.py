@@ -49,6 +49,14 @@ def scene(rows: int = 96, cols: int = 110, seed: int = 0) -> np.ndarray:
     return plane
 
 
+def lit(plane: np.ndarray, light: float, *places: tuple[float, float], radius: float = 5.0) -> np.ndarray:
+    """The plane with discs of that light."""
+    rows, cols = np.indices(plane.shape)
+    for row, col in places:
+        plane = np.where(np.hypot(rows - row, cols - col) < radius, np.float32(light), plane)
+    return plane
+
+
 def rmse(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sqrt(np.mean((a - b) ** 2)))
 
@@ -112,10 +120,8 @@ def clipped_lamps(width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, Uni
     """Lamps of 1.5 to 25 times saturation: photo, truth, unclipped pixels nearby, blur and noise."""
     rng = np.random.default_rng(3)
     sharp = scene(170, 180, seed=2) * 0.6
-    rows, cols = np.mgrid[:170, :180]
     for light in (1.5, 3.0, 6.0, 12.0, 25.0):
-        row, col = rng.uniform(30, 140, 2)
-        sharp[np.hypot(rows - row, cols - col) < rng.uniform(1.0, 5.0)] = light
+        sharp = lit(sharp, light, tuple(rng.uniform(30, 140, 2)), radius=rng.uniform(1.0, 5.0))
     blur = UniformBlur(gaussian(17, np.eye(2) * width**2))
     truth, noise = blur.frame(sharp), NoiseModel(2e-5, 1e-6)
     seen = blur.forward(sharp)
@@ -266,12 +272,8 @@ def test_measured_acceleration_is_biggs_and_andrews_own() -> None:
 def test_clipped_lights_do_not_ring_into_their_neighbours() -> None:
     rng = np.random.default_rng(8)
     background = 0.2 + 0.05 * ndimage.gaussian_filter(rng.standard_normal((140, 140)), 1.5).astype(np.float32)
-    lights = background.copy()
-    rows, cols = np.mgrid[:140, :140]
-    for row, col, value in ((50, 60, 10.0), (95, 88, 20.0)):
-        lights[np.hypot(rows - row, cols - col) < 4] = value
-    kernel = gaussian(17, np.eye(2) * 4)
-    blur = UniformBlur(kernel)
+    lights = lit(lit(background, 10.0, (50, 60), radius=4), 20.0, (95, 88), radius=4)
+    blur = UniformBlur(gaussian(17, np.eye(2) * 4))
     noise = (rng.standard_normal((124, 124)) * 1e-3).astype(np.float32)
     sensor = Sensor(NoiseModel(1e-6, 1e-6), clip=1.0)
     photo = np.minimum(blur.forward(lights), 1.0) + noise
@@ -290,10 +292,7 @@ def test_clipped_lights_do_not_ring_into_their_neighbours() -> None:
 @pytest.mark.parametrize("light", [1.5, 20.0])
 def test_standard_method_does_not_ring_around_clipped_lights(light: float) -> None:
     rng = np.random.default_rng(8)
-    sharp = scene(140, 140) * 0.5
-    rows, cols = np.mgrid[:140, :140]
-    for row, col in ((50, 60), (95, 88)):
-        sharp[np.hypot(rows - row, cols - col) < 5] = light
+    sharp = lit(scene(140, 140) * 0.5, light, (50, 60), (95, 88))
     blur = UniformBlur(gaussian(17, np.eye(2) * 4))
     truth = blur.frame(sharp)
     photo = np.minimum(blur.forward(sharp), 1.0) + 1e-3 * rng.standard_normal((124, 124))

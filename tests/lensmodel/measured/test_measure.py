@@ -50,7 +50,7 @@ def board_scene(square_px: float, shape: tuple[int, int], setup: targets.Setup) 
     dark = (np.floor(a) + np.floor(b)) % 2 > 0
     light = np.where(dark, np.float32(0.12), np.float32(0.8))
     plane = np.maximum(targets.to_pixels(light), 0.0) * targets.falloff(shape, setup)
-    return np.ascontiguousarray(np.broadcast_to(plane.astype(np.float32), (3, *plane.shape)))
+    return plane.astype(np.float32)
 
 
 def light_scene(spacing: int, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
@@ -70,21 +70,17 @@ def light_scene(spacing: int, shape: tuple[int, int], rng: np.random.Generator) 
         flux = 0.25 * 10.0 ** rng.uniform(0.0, 0.7)
         rows, cols = t + round(r), t + round(c)
         plane[np.ix_(rows, cols)] += flux * np.outer(np.sinc(rows - r) * taper, np.sinc(cols - c) * taper)
-    plane += 0.003  # a night sky over a suburb
-    return np.ascontiguousarray(np.broadcast_to(plane.astype(np.float32), (3, *plane.shape)))
+    return (plane + 0.003).astype(np.float32)  # a night sky over a suburb
 
 
 def moved_scene(scene: np.ndarray, shift: tuple[float, float], turn_deg: float) -> np.ndarray:
     """What a tripod that gave way a little shows of a scene: moved by parts of a pixel, and turned."""
     angle = math.radians(turn_deg)
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    middle = (np.array(scene.shape[1:]) - 1.0) / 2.0
+    middle = (np.array(scene.shape) - 1.0) / 2.0
     start = middle - turn @ (middle + np.array(shift))
-    planes = [
-        ndimage.affine_transform(plane, turn, start, order=5, mode="mirror", output=np.float32)
-        for plane in scene
-    ]
-    return np.ascontiguousarray(np.maximum(np.stack(planes), 0.0))
+    moved = ndimage.affine_transform(scene, turn, start, order=5, mode="mirror", output=np.float32)
+    return np.maximum(moved, 0.0)
 
 
 def grey_photo(aperture: float | None = 2.0) -> LinearPhoto:
@@ -321,7 +317,7 @@ def test_a_photo_without_a_target_is_refused() -> None:
 
 
 def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
-    scene = light_scene(60, SHAPE, np.random.default_rng(3))[1]
+    scene = light_scene(60, SHAPE, np.random.default_rng(3))
     photo = photo_of(scene, lopsided())
     found = Points(across=2, down=2).measure([photo], size=21, channels=("g",))
     errors = [distance(one.kernel, lopsided()).rel_l2 for one in found]
@@ -376,9 +372,7 @@ def pair_of(texture: NDArray[np.floating] | float, *, moved: bool = True) -> lis
     padded = [n + 2 * targets.MARGIN for n in PAIR_SHAPE]
     noise = texture * np.random.default_rng(5).standard_normal(padded)
     scene = signal.fftconvolve(np.clip(0.4 + noise, 0.05, 0.9), gaussian(9, np.eye(2) * 0.2), mode="same")
-    closed = scene
-    if moved:
-        closed = moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
+    closed = moved_scene(scene.astype(np.float32), (0.4, -0.7), 0.05) if moved else scene
     return [photo_of(scene, lopsided()), photo_of(closed, at_f8(), 1, 8.0)]
 
 
@@ -400,13 +394,11 @@ def test_what_demosaicing_makes_up_does_not_come_into_the_kernel_of_a_pair(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rng = np.random.default_rng(6)
-    height, width = (n + 2 * targets.MARGIN for n in SHAPE)
-    f = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width))
-    natural = np.fft.irfft2(
-        np.fft.rfft2(rng.standard_normal((height, width))) / np.maximum(f, 0.01), (height, width)
-    )
+    sides = [n + 2 * targets.MARGIN for n in SHAPE]
+    f = np.hypot(np.fft.fftfreq(sides[0])[:, None], np.fft.rfftfreq(sides[1]))
+    natural = np.fft.irfft2(np.fft.rfft2(rng.standard_normal(sides)) / np.maximum(f, 0.01), sides)
     scene = np.clip(0.4 + 0.12 * natural / natural.std(), 0.05, 0.9)
-    moved = moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
+    moved = moved_scene(scene.astype(np.float32), (0.4, -0.7), 0.05)
     pair = [demosaiced(photo_of(scene, lopsided())), demosaiced(photo_of(moved, at_f8(), 1, 8.0))]
 
     now = error_of_pair(pair, 128)
@@ -449,7 +441,7 @@ def test_a_pair_of_one_aperture_one_photo_and_even_sizes_are_refused(
 @pytest.mark.parametrize("covariance", [[[3.0, 0.0], [0.0, 0.8]], [[1.9, 1.1], [1.1, 1.9]]])
 def test_squares_give_the_kernel_along_and_between_their_edges(covariance: list[list[float]]) -> None:
     kernel = gaussian(21, np.array(covariance))
-    photo = photo_of(board_scene(110.0, SHAPE, targets.Setup(distortion=0.0))[1], kernel)
+    photo = photo_of(board_scene(110.0, SHAPE, targets.Setup(distortion=0.0)), kernel)
     found = SlantedEdges().measure([photo], size=21, channels=("g",))
     assert found
     seen = np.median([distance(one.kernel, kernel).rel_l2 for one in found])
@@ -459,7 +451,7 @@ def test_squares_give_the_kernel_along_and_between_their_edges(covariance: list[
 
 def test_squares_give_red_its_own_kernel_where_demosaicing_gave_it_the_sharpness_of_green() -> None:
     soft, sharp = gaussian(21, np.diag([3.0, 1.6])), gaussian(21, np.diag([0.6, 0.6]))
-    scene = board_scene(110.0, SHAPE, targets.Setup(distortion=0.0))[1]
+    scene = board_scene(110.0, SHAPE, targets.Setup(distortion=0.0))
     photo = photo_of(scene, sharp)
     photo.planes[0, ::2, ::2] = photo_of(scene, soft, 1).planes[0, ::2, ::2]
     found = SlantedEdges().measure([photo], size=21, channels=("r",))

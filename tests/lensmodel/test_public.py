@@ -280,16 +280,6 @@ def test_a_question_outside_what_the_photos_show_warns(r: float, aperture: float
         lens.psf(r, 0.6, aperture=aperture)
 
 
-def test_a_lens_comes_back_from_its_file(tmp_path: Path) -> None:
-    lens, _ = field_of_gaussians()
-    lens.save(tmp_path / "a.lensprofile")
-
-    back = Lens.load(tmp_path / "a.lensprofile")
-
-    asked = {"aperture": 2.0, "size": 15}
-    assert back.psf(0.7, 0.2, **asked).kernel == pytest.approx(lens.psf(0.7, 0.2, **asked).kernel, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("terminal", "notebook", "said"),
     [

@@ -22,7 +22,6 @@ from lensmodel.core import errors, psf
 from lensmodel.core.files import atomic, replacing, save_array, write_atomically
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.numerics import nonnegative_least_squares
-from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, Frame, LensSettings, zone_of
 
 angles = st.floats(-10, 10)
@@ -81,13 +80,6 @@ def test_one_stop_is_a_factor_of_root_two() -> None:
     assert wide is not None
     assert stopped is not None
     assert stopped - wide == pytest.approx(1.0)
-
-
-def test_registry_names_what_it_knows() -> None:
-    registry: Registry[int] = Registry("number", {"one": lambda: 1})
-
-    with pytest.raises(errors.UnknownMethodError, match="known: one"):
-        registry.create("three")
 
 
 def lopsided(size: int = 21) -> np.ndarray:

@@ -13,7 +13,6 @@ from scipy import ndimage
 
 from lensmodel import photo
 from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
-from lensmodel.core.files import from_json, to_json
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
 from lensmodel.photo.writing import write_bayer_dng
 
@@ -314,12 +313,6 @@ def test_a_turned_jpeg_is_developed_as_the_sensor_saw_it(tmp_path: Path, orienta
 
     assert (developed.planes[1, 8, 8] > 0.9, developed.planes[1, 40, 56] < 0.1) == (True, True)
     assert developed.info.metadata.orientation == orientation
-
-
-def test_all_but_the_planes_travels_as_json(tmp_path: Path) -> None:
-    developed = shot(tmp_path, raw_numbers(textured(64, 96)))
-    for value in (developed.info, developed.encoding, developed.frame):
-        assert from_json(type(value), to_json(value)) == value
 
 
 # --- real files --------------------------------------------------------------------------------

@@ -257,13 +257,6 @@ def test_zoom_passes_through_its_ends_and_lies_between() -> None:
     assert ends[0] != pytest.approx(ends[1], rel=0.02)
 
 
-def test_lateral_colour_is_a_radial_polynomial_and_green_is_the_reference() -> None:
-    fringed = lens(lateral_red=(1e-3, -4e-4))
-
-    assert fringed.lateral_shift(0.5, "r") == pytest.approx(5e-4 - 4e-4 / 8)
-    assert fringed.lateral_shift(0.9, "g") == 0.0
-
-
 def test_equal_seeds_draw_equal_lenses_and_other_seeds_others() -> None:
     assert draw_lens(4, "coma") == draw_lens(4, "coma")
     assert draw_lens(4, "coma") != draw_lens(5, "coma")
@@ -279,28 +272,6 @@ def test_drawn_lenses_have_realistic_widths(kind: str) -> None:
 
         assert 0.2 < center < 1.6
         assert max(0.5, center) < np.mean(corners) < 5.0
-
-
-@pytest.mark.parametrize(
-    ("request_", "said"),
-    [
-        (lambda: draw_lens(0).kernel(CENTER, LensSettings(aperture=1.0)), "the lens works from"),
-        (lambda: draw_lens(0).kernel(CENTER, LensSettings(focal_mm=500.0)), "covers"),
-        (lambda: draw_lens(0).kernel(CENTER, size=30), "odd"),
-        (lambda: draw_lens(0).kernel(CENTER, pitch_um=0.0), "pitch"),
-        (lambda: draw_lens(0).kernel(CENTER, pitch_um=-4.5), "pitch"),
-        (lambda: Aberrations(coma=math.nan), "finite"),
-        (lambda: Aberrations(lateral_red=(0.0, math.inf)), "finite"),
-        (lambda: Aberrations(f_number=-2.0), "f_number"),
-        (lambda: SimulatedLens((Aberrations(), Aberrations()), (70.0, 24.0)), "ascending"),
-        (lambda: SimulatedLens((Aberrations(),), (24.0, 70.0)), "one for each"),
-        (lambda: SimulatedLens((), ()), "one for each"),
-        (lambda: draw_lens(1, "magic"), "known"),
-    ],
-)
-def test_impossible_requests_are_refused_with_the_reason(request_: Callable[[], object], said: str) -> None:
-    with pytest.raises((InvalidInputError, UnknownMethodError), match=said):
-        request_()
 
 
 # ---- photos: blur by exact kernels, sensor, scenes, files
@@ -328,16 +299,6 @@ def constant(height: int, width: int, level: float = 0.5) -> Planes:
     return np.full((3, height, width), level, dtype=np.float32)
 
 
-def point_lights(height: int, width: int, spacing: int) -> tuple[Planes, NDArray[np.intp]]:
-    """Single bright pixels on a square grid over a black scene, and their rows and columns."""
-    rows = np.arange(spacing // 2, height, spacing)
-    cols = np.arange(spacing // 2, width, spacing)
-    places = np.stack(np.meshgrid(rows, cols, indexing="ij"), axis=-1).reshape(-1, 2)
-    scene = np.zeros((3, height, width), dtype=np.float32)
-    scene[:, places[:, 0], places[:, 1]] = 1.0
-    return scene, places
-
-
 @pytest.fixture(scope="module")
 def comatic() -> SimulatedLens:
     return Grey((Aberrations(f_number=2.8, coma=4.0, astigmatism=1.5, decentring=(0.1, 0.1)),))
@@ -346,11 +307,12 @@ def comatic() -> SimulatedLens:
 @pytest.fixture(scope="module")
 def lights(comatic: SimulatedLens) -> tuple[Planes, list[tuple[int, int]]]:
     """Point lights through a lens, and where they stand in the frame."""
-    scene, places = point_lights(FRAME.height + 2 * HALF, FRAME.width + 2 * HALF, 48)
+    scene = np.zeros((3, FRAME.height + 2 * HALF, FRAME.width + 2 * HALF), dtype=np.float32)
+    scene[:, 24::48, 24::48] = 1.0
     inside = [
-        (int(r) - HALF, int(c) - HALF)
-        for r, c in places
-        if 2 * HALF <= r < FRAME.height and 2 * HALF <= c < FRAME.width
+        (row - HALF, col - HALF)
+        for row, col in np.argwhere(scene[0]).tolist()
+        if 2 * HALF <= row < FRAME.height and 2 * HALF <= col < FRAME.width
     ]
     image = blurred(scene, comatic, LensSettings(), FRAME, BlurOptions(size=SIZE, step=0.12))
     return image, inside
@@ -371,9 +333,7 @@ def test_a_point_light_becomes_the_kernel_of_its_place(
     assert np.median(errors) < 0.01
     assert max(errors) < 0.03
     mirrored = comatic.kernel(FRAME.position(FRAME.height - 1 - row, col), size=SIZE)
-    assert np.linalg.norm(seen - mirrored) > 0.3 * np.linalg.norm(
-        mirrored
-    )  # it would not pass for the exact one
+    assert np.linalg.norm(seen - mirrored) > 0.3 * np.linalg.norm(mirrored)  # that would be noticed
 
 
 def test_lateral_colour_moves_red_and_blue_as_the_lens_says() -> None:
@@ -416,18 +376,6 @@ def test_scene_beyond_the_frame_shines_into_it() -> None:
     assert mirrored.max() == 0.0
 
 
-@pytest.mark.parametrize(
-    ("scene", "said"),
-    [
-        (constant(100, 100), "must exceed"),
-        (constant(FRAME.height, FRAME.width)[0], "shape"),
-    ],
-)
-def test_blur_refuses_scenes_that_do_not_fit(scene: Planes, said: str) -> None:
-    with pytest.raises(InvalidInputError, match=said):
-        blurred(scene, PERFECT, LensSettings(), FRAME, COARSE)
-
-
 def test_noise_has_the_variance_of_the_noise_model() -> None:
     camera = SimulatedCamera(256, 256, full_well_electrons=2000.0, read_noise=8.0, white_balance=(1, 1, 1))
     rng = np.random.default_rng(0)
@@ -462,38 +410,6 @@ def test_overexposure_clips_at_the_white_level() -> None:
     np.testing.assert_allclose(photo.sharp, 1.4, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"height": 15},
-        {"width": 8},
-        {"pattern": "RGBG"},
-        {"black": 20000},
-        {"white_balance": (0.5, 1.0, 1.0)},
-        {"full_well_electrons": 0.0},
-        {"read_noise": math.nan},
-        {"pitch_um": 0.0},
-    ],
-)
-def test_impossible_cameras_are_refused_by_name(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InvalidInputError, match=next(iter(wrong))):
-        SimulatedCamera(**wrong)
-
-
-@pytest.mark.parametrize("wrong", [{"exposure": 0.0}, {"scene": -1.0}, {"scene": math.nan}])
-def test_impossible_light_is_refused(wrong: dict[str, float]) -> None:
-    camera, lens = SimulatedCamera(64, 96), draw_lens(1)
-    scene = np.full((3, 64, 96), wrong.get("scene", 0.5), dtype=np.float32)
-    settings = LensSettings(aperture=lens.widest())
-    with pytest.raises(InvalidInputError, match=next(iter(wrong))):
-        photograph(scene, lens, settings, camera, None, exposure=wrong.get("exposure", 1.0))
-
-
-def test_no_step_between_exact_kernels_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match="step"):
-        BlurOptions(step=0.0)
-
-
 def test_written_photo_opens_in_libraw_with_its_lens_and_its_colours(tmp_path: Path) -> None:
     camera = SimulatedCamera(64, 96, pattern="GBRG")
     scene = np.empty((3, 64, 96), dtype=np.float32)
@@ -519,18 +435,11 @@ def test_written_photo_opens_in_libraw_with_its_lens_and_its_colours(tmp_path: P
 def test_edge_pixels_hold_the_exact_area() -> None:
     fine = 400
     t = (np.arange(fine) + 0.5) / fine - 0.5
-    for normal in (0.3, 1.2, -2.0, 2.9):
+    for normal in (0.0, 0.3, 1.2, -2.0, 2.9):
         for row, col in ((0.0, 0.0), (0.3, -0.2), (-0.5, 0.4)):
             distance = (col + t)[None, :] * math.cos(normal) - (row + t)[:, None] * math.sin(normal)
             area = edge_area(np.array(row), np.array(col), normal)
             assert area == pytest.approx((distance > 0).mean(), abs=2e-3)
-
-
-def test_edge_along_the_grid_is_the_limit_of_a_slanted_one() -> None:
-    cols = np.linspace(-1.5, 1.5, 13)
-    np.testing.assert_allclose(
-        edge_area(np.zeros(13), cols, 0.0), edge_area(np.zeros(13), cols, 1e-6), atol=1e-5
-    )
 
 
 def test_chart_has_edges_of_both_directions_in_every_zone_and_all_corners() -> None:
@@ -557,11 +466,6 @@ def test_chart_has_edges_of_both_directions_in_every_zone_and_all_corners() -> N
     assert boxes.max() == 1
 
 
-def test_chart_refuses_frames_that_are_too_small() -> None:
-    with pytest.raises(InvalidInputError, match="at least"):
-        edge_chart(Frame(200, 300))
-
-
 @pytest.mark.parametrize("name", DEMO_SCENES)
 def test_demo_scenes_load_as_linear_light(name: str) -> None:
     scene = demo_scene(name)
@@ -582,16 +486,59 @@ def test_demo_files_are_listed_with_their_licence() -> None:
     assert all(name in readme for name in names)
 
 
-def test_unknown_scenes_are_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="colosseum"):
-        demo_scene("nowhere")
-    with pytest.raises(InvalidInputError, match="known"):
-        demo_data_path("nowhere.png")
-    (tmp_path / "text.png").write_bytes(b"no picture")
-    with pytest.raises(NotAnImageError):
-        load_scene(tmp_path / "text.png")
-
-
 def test_srgb_curve_is_undone(tmp_path: Path) -> None:
     Image.fromarray(np.full((4, 6, 3), 188, dtype=np.uint8)).save(tmp_path / "grey.png")
     assert load_scene(tmp_path / "grey.png") == pytest.approx(0.5029, abs=1e-3)
+
+
+# ---- what is refused
+
+
+def light(level: float = 0.5, *, exposure: float = 1.0) -> None:
+    photograph(
+        constant(64, 96, level), PERFECT, LensSettings(), SimulatedCamera(64, 96), None, exposure=exposure
+    )
+
+
+@pytest.mark.parametrize(
+    ("request_", "said"),
+    [
+        (lambda: draw_lens(0).kernel(CENTER, LensSettings(aperture=1.0)), "the lens works from"),
+        (lambda: draw_lens(0).kernel(CENTER, LensSettings(focal_mm=500.0)), "covers"),
+        (lambda: draw_lens(0).kernel(CENTER, size=30), "odd"),
+        (lambda: draw_lens(0).kernel(CENTER, pitch_um=0.0), "pitch"),
+        (lambda: Aberrations(coma=math.nan), "finite"),
+        (lambda: Aberrations(lateral_red=(0.0, math.inf)), "finite"),
+        (lambda: Aberrations(f_number=-2.0), "f_number"),
+        (lambda: SimulatedLens((Aberrations(), Aberrations()), (70.0, 24.0)), "ascending"),
+        (lambda: SimulatedLens((Aberrations(),), (24.0, 70.0)), "one for each"),
+        (lambda: SimulatedLens((), ()), "one for each"),
+        (lambda: draw_lens(1, "magic"), "known"),
+        (lambda: SimulatedCamera(height=15), "height"),
+        (lambda: SimulatedCamera(width=8), "width"),
+        (lambda: SimulatedCamera(pattern="RGBG"), "pattern"),
+        (lambda: SimulatedCamera(black=20000), "black"),
+        (lambda: SimulatedCamera(white_balance=(0.5, 1.0, 1.0)), "white_balance"),
+        (lambda: SimulatedCamera(full_well_electrons=0.0), "full_well_electrons"),
+        (lambda: SimulatedCamera(read_noise=math.nan), "read_noise"),
+        (lambda: SimulatedCamera(pitch_um=0.0), "pitch_um"),
+        (lambda: light(exposure=0.0), "exposure"),
+        (lambda: light(-1.0), "scene"),
+        (lambda: light(math.nan), "scene"),
+        (lambda: blurred(constant(100, 100), PERFECT, LensSettings(), FRAME, COARSE), "must exceed"),
+        (lambda: blurred(constant(240, 360)[0], PERFECT, LensSettings(), FRAME, COARSE), "shape"),
+        (lambda: BlurOptions(step=0.0), "step"),
+        (lambda: edge_chart(Frame(200, 300)), "at least"),
+        (lambda: demo_scene("nowhere"), "colosseum"),
+        (lambda: demo_data_path("nowhere.png"), "known"),
+    ],
+)
+def test_impossible_requests_are_refused_with_the_reason(request_: Callable[[], object], said: str) -> None:
+    with pytest.raises((InvalidInputError, UnknownMethodError), match=said):
+        request_()
+
+
+def test_what_is_no_picture_is_no_scene(tmp_path: Path) -> None:
+    (tmp_path / "text.png").write_bytes(b"no picture")
+    with pytest.raises(NotAnImageError):
+        load_scene(tmp_path / "text.png")

@@ -1,9 +1,12 @@
-"""docs/library.md: its five lines run, and every code block does, from top to bottom, on simulated photos."""
+"""docs/library.md: its five lines run, also without any extra, and so does every code block."""
 
 from __future__ import annotations
 
 import math
 import re
+import subprocess
+import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +23,8 @@ from lensmodel.quality import mtf50_from_kernel
 from lensmodel.simulate import BlurOptions, SimulatedCamera, demo_scene, draw_lens, photograph, write_photo
 
 PAGE = Path(__file__).parents[2] / "docs" / "library.md"
-BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+FIVE_LINES = BLOCKS[0]
 CAMERA = SimulatedCamera(height=384, width=576, pitch_um=9.0)
 WIDTH_PX = 1.2
 SHOTS = {"a.dng": ("tea-gardens", 400), "b.dng": ("lake", 400), "c.dng": ("city", 500)}
@@ -60,7 +64,7 @@ def test_the_five_lines_run(
     monkeypatch.chdir(smallest_photos)
     names: dict[str, Any] = {}
 
-    exec(BLOCK.findall(PAGE.read_text(encoding="utf-8"))[0], names)
+    exec(FIVE_LINES, names)
 
     lens, kernel, corrected = names["lens"], names["kernel"], names["photo"].planes
     assert sorted(lens.profile.photos.values()) == ["a.dng", "b.dng"]
@@ -77,18 +81,17 @@ def test_the_five_lines_run(
 @pytest.mark.slow
 def test_every_block_of_the_page_runs(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(photos)
-    blocks = BLOCK.findall(PAGE.read_text(encoding="utf-8"))
     known = {name: dict(registry.entries) for name, registry in _registries().items()}
     names: dict[str, Any] = {"__name__": "__main__"}
     try:
-        for number, block in enumerate(blocks):
+        for number, block in enumerate(BLOCKS):
             exec(compile(block, f"library.md, block {number}", "exec"), names)
     finally:
         for name, registry in _registries().items():
             for entry in set(registry.entries) - set(known[name]):
                 registry.entries.pop(entry)  # type: ignore[attr-defined]
 
-    assert len(blocks) == PAGE.read_text(encoding="utf-8").count("```python") > 5
+    assert len(BLOCKS) == PAGE.read_text(encoding="utf-8").count("```python") > 5
     assert names["kernel"].shape == (55, 55)
     assert names["photo"].planes.shape == (3, CAMERA.height, CAMERA.width)
     assert {"c.tif", "my-24mm.lensprofile"} <= {path.name for path in photos.iterdir()}
@@ -97,3 +100,63 @@ def test_every_block_of_the_page_runs(photos: Path, monkeypatch: pytest.MonkeyPa
 
 def _registries() -> dict[str, Any]:
     return {"estimators": lensmodel.estimators, "deconvolvers": lensmodel.deconvolvers}
+
+
+# ---- where no extra of the package is installed
+
+ABSENT = [
+    *("alembic", "dbos", "fastapi", "httpx2", "jinja2", "obstore", "prometheus_client", "pydantic"),
+    *("pydantic_settings", "sqlalchemy", "sse_starlette", "starlette", "structlog", "uvicorn"),
+    *("astropy", "distributed", "matplotlib", "skimage", "sklearn"),
+]
+"""What the extras bring, as it is imported."""
+
+PROLOGUE = f"""
+import sys
+
+sys.modules |= dict.fromkeys({ABSENT!r})  # None: as if it were not installed
+import numpy as np
+import lensmodel
+from lab.kernels import gaussian
+from lensmodel.photo.writing import write_bayer_dng
+from lensmodel.photo.values import PhotoMetadata
+
+rows, cols = np.ogrid[:160, :240]
+mosaic = (4000 + 2000 * np.sin(rows / 7.0) * np.cos(cols / 9.0)).astype(np.uint16)
+for name in "abc":
+    write_bayer_dng(name + ".dng", mosaic, black=512, white=16383, metadata=PhotoMetadata(aperture=1.4))
+lensmodel.estimators.create("default"), lensmodel.selectors.create("r-map")
+calibrate = lensmodel.calibrate  # it is imported, but takes minutes, and refuses such small photos
+spots = [gaussian(15, np.eye(2))] * 8
+lens = lensmodel.Lens.from_kernels(spots, np.linspace(0.1, 0.9, 8), np.linspace(-3.0, 3.0, 8), aperture=1.4)
+lensmodel.calibrate = lambda photos: lens
+"""
+EPILOGUE = """
+assert (kernel.shape, kernel.dtype) == ((55, 55), np.float64) and abs(kernel.sum() - 1.0) < 1e-9
+assert (photo.planes.shape, photo.planes.dtype) == ((3, 160, 240), np.float32)
+assert lensmodel.Lens.load("my-24mm.lensprofile").samples
+try:
+    calibrate(["a.dng", "b.dng"], workers=1)
+except lensmodel.LensModelError as error:
+    print(error)
+"""
+
+
+def test_the_package_itself_begins_with_the_same_lines() -> None:
+    assert lensmodel.__doc__ is not None
+    assert textwrap.indent(FIVE_LINES, "    ") in lensmodel.__doc__
+
+
+def test_the_five_lines_run_without_any_extra(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PROLOGUE + FIVE_LINES + EPILOGUE],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"PYTHONPATH": str(PAGE.parents[1]), "OMP_NUM_THREADS": "1"},
+    )
+
+    assert done.returncode == 0, done.stderr
+    assert "a.dng" in done.stdout  # why the photos were refused
+    assert (tmp_path / "c.tif").exists()

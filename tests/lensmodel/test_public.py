@@ -51,16 +51,15 @@ def test_importing_the_library_brings_no_more_than_it_needs(code: str, unwanted:
 # --- a field from arrays ----------------------------------------------------------------------
 
 
-def field_of_gaussians(n: int = 24) -> tuple[Lens, np.ndarray]:
+@pytest.fixture(scope="module")
+def lens() -> Lens:
     rng = np.random.default_rng(0)
-    r, phi = np.sqrt(rng.random(n)), rng.uniform(-np.pi, np.pi, n)
+    r, phi = np.sqrt(rng.random(24)), rng.uniform(-np.pi, np.pi, 24)
     kernels = np.stack([gaussian(15, np.eye(2) * (0.8 + 2.0 * radius)) for radius in r])
-    return Lens.from_kernels(kernels, r, phi, aperture=2.0), r
+    return Lens.from_kernels(kernels, r, phi, aperture=2.0)
 
 
-def test_a_lens_of_kernels_is_softer_where_they_were() -> None:
-    lens, _ = field_of_gaussians()
-
+def test_a_lens_of_kernels_is_softer_where_they_were(lens: Lens) -> None:
     center, corner = lens.mtf([0.0, 0.9], [0.0, 0.5], [0.0, 0.2], aperture=2.0)[0]
 
     assert (center[0], corner[0]) == pytest.approx((1.0, 1.0))
@@ -68,16 +67,12 @@ def test_a_lens_of_kernels_is_softer_where_they_were() -> None:
     assert center[1] == pytest.approx(np.exp(-2 * np.pi**2 * 0.2**2 * 0.8), abs=0.1)
 
 
-def test_a_lens_is_shown_in_words() -> None:
-    lens, _ = field_of_gaussians()
-
+def test_a_lens_is_shown_in_words(lens: Lens) -> None:
     assert "0x" not in repr(lens)
     assert f"{len(lens.samples)} samples" in repr(lens)
 
 
-def test_many_kernels_at_once_are_those_of_single_questions() -> None:
-    lens, _ = field_of_gaussians()
-
+def test_many_kernels_at_once_are_those_of_single_questions(lens: Lens) -> None:
     many = lens.kernels([[0.1], [0.8]], [0.3, 2.0, -1.0], aperture=2.0, size=15)
 
     assert many.shape == (2, 3, 15, 15)
@@ -117,10 +112,8 @@ def test_a_kernel_that_is_given_off_center_is_centered() -> None:
     assert sample.kernel.sum() == pytest.approx(1.0)
 
 
-def test_the_map_is_that_of_the_kernels_and_row_0_is_the_top() -> None:
+def test_the_map_is_that_of_the_kernels_and_row_0_is_the_top(lens: Lens) -> None:
     r, phi = field_grid(2, 3, aspect=1.5)
-    lens, _ = field_of_gaussians()
-
     assert phi[0, 1] == pytest.approx(np.pi / 2)
     assert (r[0, 0], np.cos(phi[0, 2]) > 0, np.sin(phi[1, 0]) < 0) == (pytest.approx(r[1, 2]), True, True)
     assert lens.mtf50_map(2, 3, aperture=2.0).shape == (2, 2, 3)
@@ -148,16 +141,12 @@ def test_arrays_that_do_not_fit_each_other_are_refused(change: dict[str, Any]) -
     ],
     ids=str,
 )
-def test_frequencies_that_no_contrast_has_are_refused(frequencies: Any, text: str) -> None:
-    lens, _ = field_of_gaussians()
-
+def test_frequencies_that_no_contrast_has_are_refused(frequencies: Any, text: str, lens: Lens) -> None:
     with pytest.raises(InvalidInputError, match=text):
         lens.mtf(0.5, 0.0, frequencies)
 
 
-def test_places_whose_shapes_do_not_fit_are_refused() -> None:
-    lens, _ = field_of_gaussians()
-
+def test_places_whose_shapes_do_not_fit_are_refused(lens: Lens) -> None:
     with pytest.raises(InvalidInputError, match=r"\(2,\) and \(3,\)"):
         lens.kernels([0.1, 0.2], [0.0, 1.0, 2.0])
 
@@ -172,8 +161,7 @@ class Doubled:
         return blurred
 
 
-def test_an_array_is_corrected_by_a_name_and_by_an_object(tmp_path: Path) -> None:
-    lens, _ = field_of_gaussians()
+def test_an_array_is_corrected_by_a_name_and_by_an_object(tmp_path: Path, lens: Lens) -> None:
     planes = np.random.default_rng(1).random((3, 96, 128), dtype=np.float32)
     output = tmp_path / "out.tif"
 
@@ -185,8 +173,7 @@ def test_an_array_is_corrected_by_a_name_and_by_an_object(tmp_path: Path) -> Non
     assert output.stat().st_size > planes.size * 2
 
 
-def test_what_would_be_lost_work_is_refused_before_it() -> None:
-    lens, _ = field_of_gaussians()
+def test_what_would_be_lost_work_is_refused_before_it(lens: Lens) -> None:
     planes = np.zeros((3, 8, 8), dtype=np.float32)
 
     with pytest.raises(InvalidInputError, match=r"no format for out\.xyz"):
@@ -202,9 +189,7 @@ def test_what_would_be_lost_work_is_refused_before_it() -> None:
 
 
 @pytest.mark.parametrize("value", [-1.0, 0.0, float("nan")])
-def test_an_aperture_that_no_lens_has_is_refused_before_a_photo_is_read(value: float) -> None:
-    lens, _ = field_of_gaussians()
-
+def test_an_aperture_that_no_lens_has_is_refused_before_a_photo_is_read(value: float, lens: Lens) -> None:
     for refused in (
         lambda: lensmodel.photo_from_array(np.zeros((3, 8, 8)), aperture=value),
         lambda: lensmodel.correct("gone.dng", lens, aperture=value),
@@ -226,8 +211,7 @@ def test_a_calibration_that_asks_for_nothing_is_refused_at_once(asked: dict[str,
         lensmodel.calibrate([], **asked)  # type: ignore[arg-type]
 
 
-def test_a_photo_is_not_replaced_by_its_correction(tmp_path: Path) -> None:
-    lens, _ = field_of_gaussians()
+def test_a_photo_is_not_replaced_by_its_correction(tmp_path: Path, lens: Lens) -> None:
     path = tmp_path / "one.tif"
     path.write_bytes(b"II*\0")
 
@@ -245,8 +229,7 @@ def test_a_registered_method_is_known_by_its_name() -> None:
         registry.register("first", Doubled)
 
 
-def test_a_registered_method_is_seen_by_a_correction(monkeypatch: pytest.MonkeyPatch) -> None:
-    lens, _ = field_of_gaussians()
+def test_a_registered_method_is_seen_by_a_correction(monkeypatch: pytest.MonkeyPatch, lens: Lens) -> None:
     planes = np.random.default_rng(1).random((3, 64, 64), dtype=np.float32)
     monkeypatch.delitem(lensmodel.deconvolvers.entries, "doubled", raising=False)  # type: ignore[arg-type]
     lensmodel.deconvolvers.register("doubled", Doubled)

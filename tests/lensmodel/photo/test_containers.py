@@ -582,11 +582,7 @@ def test_a_damaged_header_gives_our_errors_or_a_photo(
     data: st.DataObject, kind: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.mktemp("fuzz") / "x"
-    if kind == "DNG":
-        write_bayer_dng(path, np.full((32, 32), 900, dtype=np.uint16), black=512, white=15000)
-    else:
-        path.write_bytes(encoded(kind))
-    damaged = bytearray(path.read_bytes())
+    damaged = bytearray(_whole(kind, path))
     places = st.tuples(st.integers(0, min(len(damaged), 600) - 1), st.integers(0, 255))
     for at, value in data.draw(st.lists(places, min_size=1, max_size=6)):
         damaged[at] = value

@@ -32,7 +32,6 @@ from lensmodel.photo.writing import write_bayer_dng
 # Lens names that EXPECTED.tsv gives from ExifTool's own tables, not from text in the file.
 _LOOKED_UP = {"61182", "Unknown (00 77 48 5C 80 24 24 0E)"}
 Read = Callable[[bytes], photo.PhotoMetadata]
-_XMP_HEAD = "http://ns.adobe.com/xap/1.0/\0"
 
 
 def read_metadata(path: Path) -> photo.PhotoMetadata:
@@ -42,7 +41,7 @@ def read_metadata(path: Path) -> photo.PhotoMetadata:
 
 
 def jpeg_with(
-    main: dict[int, object] | None = None, exif: dict[int, object] | None = None, xmp: str | None = None
+    main: dict[int, object] | None = None, exif: dict[int, object] | None = None, xmp: str = ""
 ) -> bytes:
     """JPEG of 64 x 48 pixels whose EXIF was written by Pillow, not by us."""
     block = Image.Exif()
@@ -50,12 +49,8 @@ def jpeg_with(
         block[tag] = value
     block.get_ifd(0x8769).update(exif or {})
     out = io.BytesIO()
-    Image.new("RGB", (64, 48), "grey").save(out, "JPEG", exif=block)
-    data = out.getvalue()
-    if xmp is None:
-        return data
-    packet = (_XMP_HEAD + xmp).encode()
-    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(packet) + 2) + packet + data[2:]
+    Image.new("RGB", (64, 48), "grey").save(out, "JPEG", exif=block, xmp=xmp.encode())
+    return out.getvalue()
 
 
 def xmp_with(properties: str, head: str = "") -> str:

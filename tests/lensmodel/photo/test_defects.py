@@ -44,10 +44,6 @@ def mosaic(scene: str = "spices", *, xtrans: bool = False, height: int = 400) ->
     return np.clip(CAMERA.black + RANGE * (seen + noise), 0, CAMERA.white).astype(np.uint16)
 
 
-def places(count: int, seed: int = 0) -> NDArray[np.int64]:
-    return np.random.default_rng(seed).permutation(400 * 600)[:count]
-
-
 def defective(clean: NDArray[np.uint16], at: NDArray[np.int64]) -> NDArray[np.uint16]:
     """Let pixels shine by a tenth to all of the range."""
     rng = np.random.default_rng(1)
@@ -85,8 +81,9 @@ def test_defects_are_replaced_and_told(
     # 11 and 110 are as 60 and 600 of 1.3 million
     save, height = (write_xtrans, 600) if xtrans else (write, 400)
     seen = mosaic(xtrans=xtrans, height=height)
+    hot = np.random.default_rng(0).permutation(400 * 600)[:count]
     clean = photo.develop(save(tmp_path / "clean.dng", seen))
-    repaired = photo.develop(save(tmp_path / "hot.dng", defective(seen, places(count))))
+    repaired = photo.develop(save(tmp_path / "hot.dng", defective(seen, hot)))
 
     assert clean.remarks == ()
     assert (clean.cfa is None) == xtrans

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
-from scipy import ndimage
 
 from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, ZONES, Plane, Planes, Zone
@@ -260,12 +259,14 @@ def _around(totals: Sequence[Real] | Real) -> Real:
 
 def _lower(keep: Real, shares: Real) -> None:
     """Lower `keep` to the shares of blocks, interpolated between their middles, in place."""
-    middle = (_SIDE - 1) / 2.0
-    at = [
-        np.clip((np.arange(n) - middle) / _SIDE, 0.0, m - 1.0)
-        for n, m in zip(keep.shape, shares.shape, strict=True)
-    ]
-    np.minimum(keep, ndimage.map_coordinates(shares, np.meshgrid(*at, indexing="ij"), order=1), out=keep)
+    for axis, extent in enumerate(keep.shape):
+        last = shares.shape[axis] - 1
+        at = np.clip((np.arange(extent) - (_SIDE - 1) / 2.0) / _SIDE, 0.0, last)
+        first = at.astype(np.intp)
+        part = np.expand_dims((at - first).astype(np.float32), 1 - axis)
+        low, high = shares.take(first, axis), shares.take(np.minimum(first + 1, last), axis)
+        shares = low + part * (high - low)
+    np.minimum(keep, shares, out=keep)
 
 
 @dataclass(frozen=True, slots=True)

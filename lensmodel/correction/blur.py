@@ -383,12 +383,20 @@ def fitted_halo(cell: tuple[int, int], least: int) -> int:
     return least + min(np.subtract(fast_shape(needed), needed)) // 2
 
 
+@jit
 def block_sums(plane: Real, side: int) -> Real:
     """Sums over square blocks of a plane's pixels; the last ones may be smaller."""
-    rows, cols = (-(-extent // side) for extent in plane.shape)
-    whole = np.pad(plane, [(0, side * n - have) for n, have in zip((rows, cols), plane.shape, strict=True)])
-    # one axis after the other: `np.add.reduceat`, or both at once, takes several times as long
-    return np.asarray(whole.reshape(rows, side, -1).sum(axis=1).reshape(rows, cols, side).sum(axis=2))
+    rows, cols = plane.shape
+    sums = np.zeros((-(-rows // side), -(-cols // side)), np.float32)
+    line = np.empty(cols, np.float32)
+    for block in range(sums.shape[0]):
+        line[:] = ZERO
+        for i in range(side * block, min(side * block + side, rows)):
+            for j in range(cols):
+                line[j] += plane[i, j]
+        for j in range(cols):
+            sums[block, j // side] += line[j]
+    return sums
 
 
 def spread_blocks(blocks: NDArray[np.float32], canvas: Canvas) -> NDArray[np.float32]:

@@ -168,15 +168,30 @@ def _pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
 @jit
 def _drifted(x: Real, drift: Complex, down: Real, across: Real, work: Real, D: Complex, E: Complex) -> None:
     """What the change of the kernel adds to the prediction, as a spectrum, into `E`."""
-    E[:] = 0
+    height, width = x.shape
     for way in range(2):
-        work[:] = x * (down.reshape((-1, 1)) if way == 0 else across.reshape((1, -1)))
+        for i in range(height):
+            for j in range(width):
+                work[i, j] = x[i, j] * (down[i] if way == 0 else across[j])
         to_spectrum(work, D)
-        E += drift[way] * D
+        for i in range(height):
+            for j in range(D.shape[1]):
+                term = drift[way, i, j] * D[i, j]
+                E[i, j] = term if way == 0 else E[i, j] + term
 
 
 @jit
-def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
+def _predict(X: Complex, K: Complex, E: Complex, P: Complex) -> None:
+    """Spectrum of the estimate X blurred by K, and what the change of the kernel adds to it, into `P`."""
+    for i in range(P.shape[0]):
+        for j in range(P.shape[1]):
+            P[i, j] = K[i, j] * X[i, j]
+    if E.shape[0] > 0:
+        P += E
+
+
+@jit
+def half_quadratic(  # noqa: C901 - one pass over memory per loop
     y: Real,
     known: NDArray[np.bool_],
     K: Complex,
@@ -218,10 +233,8 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
             if drifts and (step == 0 or step == steps // 2):
                 _drifted(x[c], drift[c], down, across, work, D, E[c])
             if not whole:
-                S[c] = K[c] * X[c]
-                if drifts:
-                    S[c] += E[c]
-                P[:] = S[c]
+                _predict(X[c], K[c], E[c] if drifts else D[:0], P)
+                S[c] = P
                 to_plane(P, work)
                 for i in range(height):
                     for j in range(width):
@@ -243,9 +256,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
             X[c] = P
             to_plane(P, x[c])
     for c in range(channels):
-        P[:] = K[c] * X[c]
-        if drifts:
-            P += E[c]
+        _predict(X[c], K[c], E[c] if drifts else D[:0], P)
         to_plane(P, explained[c])
     return x, explained
 
@@ -465,7 +476,8 @@ def _gradient_power(shape: tuple[int, int]) -> Real:
 
 def _local_means(plane: Real) -> Real:
     """Means over blocks of 4 pixels, smoothed: over about 13 pixels."""
-    plane = block_sums(plane, BLOCK) / block_sums(np.ones_like(plane), BLOCK)
+    counts = (np.minimum(BLOCK, extent - np.arange(0, extent, BLOCK)) for extent in plane.shape)
+    plane = block_sums(plane, BLOCK) / np.outer(*counts).astype(np.float32)
     for axis in (0, 1):
         plane = ndimage.convolve1d(plane, [1 / 6, 4 / 6, 1 / 6], axis=axis, mode="nearest")
     return np.asarray(plane, dtype=np.float32)

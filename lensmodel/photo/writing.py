@@ -399,7 +399,8 @@ def demosaiced(steps: list[Opcode], cfa: BayerPattern | None) -> tuple[list[Opco
         if pitch == (2, 2) and cfa is not None:
             colour = cfa[top % 2][left % 2]
             if colour == 1:
-                gains = np.sqrt(np.frombuffer(gains[: len(gains) // 4 * 4], ">f4")).astype(">f4").tobytes()
+                whole = np.frombuffer(gains[: len(gains) // 4 * 4], ">f4")
+                gains = np.sqrt(np.maximum(whole, 0.0)).astype(">f4").tobytes()
             # the two rows and columns between whose pixels the others stood
             area = (top - top % 2, left - left % 2, bottom + bottom % 2, right + right % 2, colour, 1)
         elif pitch == (1, 1):

@@ -10,7 +10,7 @@ import numpy as np
 
 from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, ZONES, Plane, Planes, Zone
-from lensmodel.correction.blur import Complex, Real, UniformBlur, block_sums, fast_shape, smooth, through
+from lensmodel.correction.blur import Complex, Real, UniformBlur, fast_shape, smooth, through
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.richardson_lucy import LEAST_CLIPPED
 
@@ -106,12 +106,14 @@ def kept_shares(
     y, x = (np.ascontiguousarray(p, dtype=np.float32) for p in (photo, restored))
     shape = (y.shape[1], y.shape[2])
     noise = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
+    powers = np.zeros((6, *_blocks(shape)), dtype=np.float32)
     clip = np.array([min(s.clip, 1e9) for s in sensors], dtype=np.float32)
     keep = np.ones(shape, dtype=np.float32)
     part = (*inner[0].indices(shape[0])[:2], *inner[1].indices(shape[1])[:2])
     spikes = _spikes(y, x, noise, clip, _point_gains(blurs), part, keep)
     checks = {ISOLATED: spikes / keep[inner].size}
-    wide = _around(_powers(y, x, noise, clip))
+    _powers(y, x, noise, clip, powers)
+    wide = _around(powers)
     known = wide[2:5].max(axis=0) + np.float32(_NOISE) * wide[5] + np.float32(1e-12)
     severities = {SPECTRUM: np.sqrt(wide[:2].max(axis=0) / known)}
     if blurs is not None:
@@ -140,21 +142,53 @@ def _point_gains(blurs: Sequence[UniformBlur] | None) -> Real:
     return np.array(gains, dtype=np.float32)
 
 
-def _powers(y: Planes, x: Planes, noise: Real, clip: Real) -> Real:
+@jit
+def _into_blocks(lines: Real, row: int, sums: Real) -> None:
+    """Add lines `(kind, cols)` to the row of blocks that holds a row of pixels."""
+    for kind in range(lines.shape[0]):
+        for block in range(sums.shape[2]):
+            total = np.float32(0.0)
+            for j in range(8 * block, min(8 * block + 8, lines.shape[1])):
+                total += lines[kind, j]
+            sums[kind, row // 8, block] += total
+
+
+@jit
+def _powers(y: Real, x: Real, noise: Real, clip: Real, powers: Real) -> None:
     """Sums over blocks of the mean of the colours: D_1, D_2 of x, D_1, D_2, D_4 of y, sigma²."""
-    shot, read = noise.T[:, :, None, None]
-    variance = (shot * np.maximum(y, np.float32(0.0)) + read).mean(axis=0) / np.float32(len(y))
-    after, before = np.minimum(x, clip[:, None, None]).mean(axis=0), y.mean(axis=0)
-    kinds = ((after, 1), (after, 2), (before, 1), (before, 2), (before, _COARSE))
-    return np.stack([block_sums(part, _SIDE) for part in (*(_contrast(*kind) for kind in kinds), variance)])
-
-
-def _contrast(light: Real, s: int) -> Real:
-    """Power of second differences at a distance of s pixels: D_s; white noise has its variance."""
-    wide = np.pad(light, s, mode="edge")
-    down = wide[: -2 * s, s:-s] + wide[2 * s :, s:-s] - (light + light)
-    across = wide[s:-s, : -2 * s] + wide[s:-s, 2 * s :] - (light + light)
-    return np.asarray((down * down + across * across) / np.float32(12.0))
+    rows, cols = y.shape[1:]
+    zero, third, ninth = np.float32(0.0), np.float32(1.0 / 3.0), np.float32(1.0 / 9.0)
+    share, rim = np.float32(1.0 / 12.0), _COARSE
+    luma = np.empty((2, rows, cols + 2 * rim), np.float32)
+    lines = np.zeros((6, cols), np.float32)
+    for i in range(rows):
+        before, after = luma[0, i, rim : rim + cols], luma[1, i, rim : rim + cols]
+        for j in range(cols):
+            before[j] = third * (y[0, i, j] + y[1, i, j] + y[2, i, j])
+            after[j] = third * (
+                min(x[0, i, j], clip[0]) + min(x[1, i, j], clip[1]) + min(x[2, i, j], clip[2])
+            )
+        luma[0, i, :rim], luma[0, i, rim + cols :] = before[0], before[cols - 1]
+        luma[1, i, :rim], luma[1, i, rim + cols :] = after[0], after[cols - 1]
+    for i in range(rows):
+        for j in range(cols):
+            total = noise[0, 1] + noise[1, 1] + noise[2, 1]
+            for c in range(3):
+                total += noise[c, 0] * max(y[c, i, j], zero)
+            lines[5, j] += ninth * total
+        for kind in range(5):
+            plane = luma[1] if kind < 2 else luma[0]
+            s = _COARSE if kind == 4 else 1 + kind % 2
+            above, here, below = plane[max(i - s, 0)], plane[i], plane[min(i + s, rows - 1)]
+            line = lines[kind]
+            for j in range(cols):
+                two = here[rim + j] + here[rim + j]
+                down = above[rim + j] + below[rim + j] - two
+                across = here[rim + j - s] + here[rim + j + s] - two
+                line[j] += share * (down * down + across * across)
+        if i % 8 == 7 or i == rows - 1:
+            _into_blocks(lines, i, powers)
+            lines[:] = zero
 
 
 @jit
@@ -213,7 +247,7 @@ def _misfit(
     """Root mean square of the residual around each block, the most of all colours."""
     shape = (y.shape[1], y.shape[2])
     grid = fast_shape(tuple(max(extent, blurs[0].kernel.shape[0]) for extent in shape))
-    worst = np.zeros([-(-extent // _SIDE) for extent in shape], dtype=np.float32)
+    worst = np.zeros(_blocks(shape), dtype=np.float32)
     limit = np.float32(LIMITS[REBLUR] ** 2)
     for c, (blur, sensor) in enumerate(zip(blurs, sensors, strict=True)):
         K = blur.spectrum(grid)
@@ -224,7 +258,7 @@ def _misfit(
             work = np.zeros(grid, dtype=np.float32)
             work[: shape[0], : shape[1]] = plane
             through(work, scratch, K, forward=True, first=0, last=shape[0], begin=0, end=shape[0])
-            return work[: shape[0], : shape[1]]
+            return work
 
         rim = min(blur.reach, (min(shape) - 1) // 2)
         counted = np.zeros(shape, dtype=np.float32)
@@ -233,40 +267,69 @@ def _misfit(
             counted *= sensor.measured
         clipped = y[c] >= np.float32(LEAST_CLIPPED * sensor.clip)
         if clipped.any():
-            counted *= spread(clipped) < _GLOW
-        number = np.maximum(_around([block_sums(counted, _SIDE)])[0], np.float32(1.0))
+            counted *= spread(clipped)[: shape[0], : shape[1]] < _GLOW
         error = max(errors[c], _MODEL_ERROR)
+        allowed = np.array([sensor.noise.shot, sensor.noise.read, error**2], dtype=np.float32)
         blurred = spread(x[c])
-        change = x[c] - blurred
-        counted /= np.maximum(
-            sensor.variance(y[c]) + np.float32(error**2) * change * change, np.float32(1e-12)
-        )
-        square = _around([block_sums(counted * (y[c] - blurred) ** 2, _SIDE)])[0]
+        sums = np.zeros((2, *worst.shape), dtype=np.float32)
+        _residual(y[c], x[c], blurred, blurred, counted, allowed, sums)
+        square, number = _around(sums)
+        number = np.maximum(number, np.float32(1.0))
         if (square > limit * number).any():  # else it does not matter what the photo itself leaves
-            own = _around([block_sums(counted * (y[c] - spread(y[c])) ** 2, _SIDE)])[0]
-            number = np.maximum(number, own / limit)
+            sums[:] = 0.0
+            _residual(y[c], x[c], blurred, spread(y[c]), counted, allowed, sums)
+            number = np.maximum(number, _around(sums)[0] / limit)
         np.maximum(worst, np.sqrt(square / number), out=worst)
     return worst
 
 
-def _around(totals: Sequence[Real] | Real) -> Real:
+@jit
+def _residual(
+    y: Real, x: Real, blurred: Real, explained: Real, counted: Real, allowed: Real, sums: Real
+) -> None:
+    """Sums over blocks of squares of what is not `explained` over what may be, and of what counts."""
+    rows, cols = y.shape
+    lines = np.zeros((2, cols), np.float32)
+    for i in range(rows):
+        for j in range(cols):
+            left, change = y[i, j] - explained[i, j], x[i, j] - blurred[i, j]
+            variance = allowed[0] * max(y[i, j], np.float32(0.0)) + allowed[1] + allowed[2] * change * change
+            lines[0, j] += counted[i, j] * left * left / max(variance, np.float32(1e-12))
+            lines[1, j] += counted[i, j]
+        if i % 8 == 7 or i == rows - 1:
+            _into_blocks(lines, i, sums)
+            lines[:] = np.float32(0.0)
+
+
+def _blocks(shape: tuple[int, int]) -> tuple[int, int]:
+    return -(-shape[0] // _SIDE), -(-shape[1] // _SIDE)
+
+
+def _around(totals: Real) -> Real:
     """Weighted sum over the 9 x 9 blocks around each; zeros outside, so that ratios stay right."""
-    out = np.empty((len(totals), *totals[0].shape), dtype=np.float32)
+    out = np.empty_like(totals)
     for figures, into in zip(totals, out, strict=True):
         smooth(figures, _WEIGHTS, into, wrapped=False)
     return out
 
 
+@jit
 def _lower(keep: Real, shares: Real) -> None:
     """Lower `keep` to the shares of blocks, interpolated between their middles, in place."""
-    for axis, extent in enumerate(keep.shape):
-        last = shares.shape[axis] - 1
-        at = np.clip((np.arange(extent) - (_SIDE - 1) / 2.0) / _SIDE, 0.0, last)
-        first = at.astype(np.intp)
-        part = np.expand_dims((at - first).astype(np.float32), 1 - axis)
-        low, high = shares.take(first, axis), shares.take(np.minimum(first + 1, last), axis)
-        shares = low + part * (high - low)
-    np.minimum(keep, shares, out=keep)
+    rows, cols = shares.shape
+    line = np.empty(cols, np.float32)
+    for i in range(keep.shape[0]):
+        at = min(max((i - 3.5) / 8.0, 0.0), rows - 1.0)
+        a = min(int(at), max(rows - 2, 0))
+        t, b = np.float32(at - a), min(a + 1, rows - 1)
+        for j in range(cols):
+            line[j] = shares[a, j] + t * (shares[b, j] - shares[a, j])
+        for j in range(keep.shape[1]):
+            at = min(max((j - 3.5) / 8.0, 0.0), cols - 1.0)
+            a = min(int(at), max(cols - 2, 0))
+            keep[i, j] = min(
+                keep[i, j], line[a] + np.float32(at - a) * (line[min(a + 1, cols - 1)] - line[a])
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,16 +13,13 @@ from numpy.typing import NDArray
 from lensmodel.core.numerics import jit
 from lensmodel.core.types import Plane, Planes
 from lensmodel.correction.blur import (
-    BLOCK,
     ONE,
     ZERO,
     Canvas,
     Complex,
     Real,
     UniformBlur,
-    block_sums,
     smooth,
-    spread_blocks,
     to_plane,
     to_spectrum,
     transfers,
@@ -44,6 +41,7 @@ _SURE: Final = np.float32(2.0)
 _CAREFUL: Final = 3.0
 """Times its noise that a cell is filtered for (chosen: of 1, 3 and 8 the most that costs no gain)."""
 _EVERY: Final = 4  # of the rows and columns suffices for a mean
+_BLOCK: Final = 4  # pixels over which a change is compared with its noise: coarser than detail (chosen)
 _AROUND: Final = np.array([1.0, 4.0, 4.0, 4.0, 1.0], dtype=np.float32)
 """Weights of the blocks around one, along rows and columns: a window of about 16 pixels (chosen: it holds
 enough pixels for a variance, and little of the next object)."""
@@ -102,7 +100,8 @@ class DirectFilter:
         amplified = np.empty(len(x), dtype=np.float32)
         _filter(x, K, over, _rise(canvas.shape, slope), amplified)
         models = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
-        restored = _where_it_stands_out(blurred, x, canvas, models * amplified[:, None])
+        restored = np.empty_like(blurred)
+        _where_it_stands_out(blurred, x, canvas.margin, models * amplified[:, None], restored)
         return Solution(restored if lights is None else lights.put_back(photo, restored))
 
 
@@ -134,16 +133,58 @@ def _filter(x: Real, K: Complex, over: Real, rise: Real, amplified: Real) -> Non
         to_plane(X, x[c])
 
 
-def _where_it_stands_out(y: Planes, x: Planes, canvas: Canvas, noise: Real) -> Planes:
-    """Mix planes and their filtered ones on a canvas by what the mean change of colours costs in `noise`."""
-    shot, read = noise.T / np.float32(len(y) ** 2)
-    difference = x[(slice(None), *canvas.data)] - y
-    change, cost = difference.mean(axis=0), np.tensordot(shot, np.maximum(y, ZERO), axes=1) + read.sum()
-    power, expected = np.empty((2, *(-(-extent // BLOCK) for extent in change.shape)), dtype=np.float32)
-    smooth(block_sums(change * change, BLOCK), _AROUND, power, False)
-    smooth(block_sums(cost, BLOCK), _AROUND, expected, False)
-    share = np.clip(ONE - _SURE * expected / np.maximum(power, np.float32(1e-20)), ZERO, ONE)
-    return np.asarray(y + spread_blocks(share, canvas)[canvas.data] * difference, dtype=np.float32)
+@jit
+def _where_it_stands_out(  # noqa: C901, PLR0912 - blocks, then pixels
+    y: Real, x: Real, margin: int, noise: Real, out: Real
+) -> None:
+    """Mix planes and their filtered ones on a canvas by what the change costs in `noise`."""
+    channels, rows, cols = y.shape
+    high, wide = -(-rows // _BLOCK), -(-cols // _BLOCK)
+    zero, one, part = np.float32(0.0), np.float32(1.0), np.float32(1.0 / channels)
+    change, light = np.empty(cols, np.float32), np.empty(cols, np.float32)
+    power, expected = np.zeros((high, wide), np.float32), np.zeros((high, wide), np.float32)
+    for i in range(rows):
+        change[:] = zero
+        light[:] = zero
+        for c in range(channels):
+            before, after = y[c, i], x[c, margin + i, margin : margin + cols]
+            shot, read = noise[c, 0] * part * part, noise[c, 1] * part * part
+            for j in range(cols):
+                change[j] += part * (after[j] - before[j])
+                light[j] += shot * max(before[j], zero) + read
+        for b in range(wide):
+            square, total = zero, zero
+            for j in range(_BLOCK * b, min(_BLOCK * b + _BLOCK, cols)):
+                square += change[j] * change[j]
+                total += light[j]
+            power[i // _BLOCK, b] += square
+            expected[i // _BLOCK, b] += total
+    share, wider = np.empty((high, wide), np.float32), np.empty((high, wide), np.float32)
+    smooth(power, _AROUND, wider, False)
+    smooth(expected, _AROUND, share, False)
+    for i in range(high):
+        for j in range(wide):
+            cost = _SURE * share[i, j] / max(wider[i, j], np.float32(1e-20))
+            share[i, j] = min(max(one - cost, zero), one)
+    line, kept = np.empty(wide + 1, np.float32), np.empty(_BLOCK * (wide + 1), np.float32)
+    half, step = _BLOCK // 2, np.float32(1.0 / _BLOCK)
+    for i in range(rows):
+        above = min(max((i - half) // _BLOCK, 0), high - 1)
+        below = min(above + 1, high - 1)
+        t = min(max((np.float32(i - half - _BLOCK * above) + np.float32(0.5)) * step, zero), one)
+        for b in range(wide):
+            line[b] = share[above, b] + t * (share[below, b] - share[above, b])
+        line[wide] = line[wide - 1]
+        for k in range(half):
+            kept[k] = line[0]
+        for b in range(wide):
+            for k in range(_BLOCK):
+                at = (np.float32(k) + np.float32(0.5)) * step
+                kept[half + _BLOCK * b + k] = line[b] + at * (line[b + 1] - line[b])
+        for c in range(channels):
+            before, after, into = y[c, i], x[c, margin + i, margin : margin + cols], out[c, i]
+            for j in range(cols):
+                into[j] = before[j] + kept[j] * (after[j] - before[j])
 
 
 @lru_cache(maxsize=16)

@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import Planes
-from lensmodel.correction.blur import ONE, ZERO, Canvas, Real, smooth
+from lensmodel.correction.blur import ONE, ZERO, Canvas, Number, Real, smooth
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.expected_gain import wiener_spectrum
+
+Mask = NDArray[np.bool_]
 
 _WINDOW: Final = 2.0
 """Standard deviation in pixels of the windows in which a colour is a straight line over green: about ten
@@ -53,11 +56,12 @@ def refill(
 ) -> None:
     """Fill in red and blue where no pixel measured them, in place, as the lens would show them.
 
-    Demosaicing copies detail from green that is sharper than blue light can be behind most lenses, of which
-    undoing blue's blur would make coloured edges. So it is blurred first as the colour itself is: with x_g
-    Wiener's estimate of green, each colour is predicted from p = K_c x_g by residual interpolation, a line
+    Demosaicing copies fine detail from green into red and blue. Behind a lens that is sharp in green and
+    soft in blue, as most are, that detail is sharper than blue light can be, and undoing blue's blur on
+    it makes coloured edges of it. So the detail is blurred first as the colour itself is: with x_g Wiener's
+    estimate of green, each colour is predicted from p = K_c x_g by residual interpolation, a line
     y = a p + b in each window, and the residual at measured pixels is interpolated. No frequency of p is
-    stronger than in green itself, or the mosaic's own pattern would come back::
+    stronger than in green itself: a blue that is believed to be sharper would get the mosaic's own pattern::
 
         y_c = a p + b + interpolated( y_c - a p - b )
 
@@ -77,34 +81,52 @@ def refill(
         guide = K[c] * sharp
         guide /= np.maximum(np.abs(guide) / light, np.float32(1.0))
         p = np.asarray(fft.irfft2(guide, shape), dtype=np.float32)
-        predicted = _lines(y[c], p, known)
-        residual = _smoothed(known * (y[c] - predicted), _BETWEEN, wrapped=True)
-        predicted += residual / np.maximum(_smoothed(known, _BETWEEN, wrapped=True), np.float32(1e-3))
+        predicted = np.empty_like(p)
+        _lines(y[c], p, known, _GAUSSIAN, _RIDGE, predicted)
+        residual = known * (y[c] - predicted)
+        share, between = np.empty_like(p), np.empty_like(p)
+        smooth(known, _BETWEEN, share, wrapped=True)
+        smooth(residual, _BETWEEN, between, wrapped=True)
+        predicted += between / np.maximum(share, np.float32(1e-3))
         np.copyto(y[c][canvas.data], predicted[canvas.data], where=~measured)
 
 
-def _lines(y: Real, p: Real, known: Real) -> Real:
+@jit
+def _lines(y: Real, p: Real, known: Real, weights: Real, least: Number, out: Real) -> None:
     """A p + b of each window's least squares over known pixels, its slope pulled to that of one hue."""
-    parts = (known, known * p, known * y, known * p * y, known * p * p)
-    count, *sums = (_smoothed(part, _GAUSSIAN, wrapped=True) for part in parts)
-    mean_p, mean_y, product, square = (each / np.maximum(count, np.float32(1e-9)) for each in sums)
-    ridge = _RIDGE * mean_p * mean_p + np.float32(1e-9)
-    hue = np.clip(mean_y / np.maximum(mean_p, np.float32(1e-6)), 0.0, 8.0)
-    slope = (product - mean_p * mean_y + ridge * hue) / (square - mean_p * mean_p + ridge)
-    return np.asarray(mean_y + slope * (p - mean_p), dtype=np.float32)
-
-
-def _smoothed(plane: Real, weights: Real, *, wrapped: bool = False) -> Real:
-    """Filter a plane along rows and columns; it continues periodically, or with zeros."""
-    out = np.empty_like(plane)
-    smooth(plane, weights, out, wrapped)
-    return out
+    rows, cols = y.shape
+    sums = np.empty((5, rows, cols), np.float32)
+    part = np.empty((rows, cols), np.float32)
+    tiny, small, most = np.float32(1e-9), np.float32(1e-6), np.float32(8.0)
+    for number in range(5):
+        for i in range(rows):
+            for j in range(cols):
+                k, a, b = known[i, j], p[i, j], y[i, j]
+                if number == 1:
+                    k *= a
+                elif number == 2:
+                    k *= b
+                elif number == 3:
+                    k *= a * b
+                elif number == 4:
+                    k *= a * a
+                part[i, j] = k
+        smooth(part, weights, sums[number], wrapped=True)
+    for i in range(rows):
+        for j in range(cols):
+            share = np.float32(1.0) / max(sums[0, i, j], tiny)
+            mean_p, mean_y = sums[1, i, j] * share, sums[2, i, j] * share
+            ridge = least * mean_p * mean_p + tiny
+            hue = min(max(mean_y / max(mean_p, small), np.float32(0.0)), most)
+            covariance = sums[3, i, j] * share - mean_p * mean_y + ridge * hue
+            slope = covariance / (sums[4, i, j] * share - mean_p * mean_p + ridge)
+            out[i, j] = mean_y + slope * (p[i, j] - mean_p)
 
 
 def spread_grain(
     photo: Planes, left: Planes, clipped: NDArray[np.bool_], sensors: Sequence[Sensor], light: Real
 ) -> Planes:
-    """What a prior took of a mosaic, to be added back: grain in light of no colour.
+    """What a prior took of a mosaic, to be added back: grain in light of no colour; `left` is overwritten.
 
     In a mosaic each pixel measures one colour k; L is the mean light, n the noise of a colour over it,
     and w weighs colours as they are seen. Of the measured residual e, the means S over 5 x 5 pixels are
@@ -118,43 +140,132 @@ def spread_grain(
         r_c / L_c = s + q ( S_c / L_c - s )
                       + t min(1, n_c / m) f + (1 - t) min(1, n_c / n_k) ( e_k - S_k ) / L_k
     """
-    known, bright, lost = ~clipped, light[:, None, None], clipped.any(axis=0)
+    known = ~clipped
     for c, sensor in enumerate(sensors):
         if sensor.measured is not None:
             known[c] &= sensor.measured
-    shot, read = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32).T
-    grain = np.maximum(np.sqrt(shot * light + read) / light, np.float32(1e-9))
-    w = (_LUMA * np.sqrt(light))[:, None, None]
-    w /= w.sum()
-    white = np.sqrt((w.ravel() * grain * grain).sum())
+    noise = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
+    out = np.empty_like(photo)
+    _spread_grain(photo, left, known, clipped, noise, light, out)
+    return out
 
-    noise = shot[:, None, None] * np.maximum(photo, ZERO) + read[:, None, None]
-    power = noise / (bright * bright)
-    variance: Real = (w * power).sum(axis=0)
-    coloured: Real = (_AVERAGED[:, None, None] * (ONE - w - w + len(photo) * w * w) * power).sum(axis=0)
-    fine: Real = (w * left / bright).sum(axis=0)
-    fine[lost] = ZERO
-    near = np.maximum(_smoothed(np.asarray(~lost, dtype=np.float32), _BINOMIAL), np.float32(1e-3))
-    fine -= _smoothed(fine, _BINOMIAL) / near
-    fine[lost] = ZERO
 
-    left = np.where(known, left, ZERO)
-    counted = [_smoothed(mask.astype(np.float32), _BINOMIAL) for mask in known]
-    means = np.stack([_smoothed(plane, _BINOMIAL) for plane in left]) / np.maximum(counted, np.float32(1e-3))
-    coarse = (w * means / bright).sum(axis=0)
-    chroma = means / bright - coarse
-    squares: Real = np.square(chroma).sum(axis=0)
-    hue = np.maximum(_smoothed(squares, _AROUND), np.float32(1e-20))
-    chroma *= np.maximum(ONE - _COLOURED * _smoothed(coloured, _AROUND) / hue, ZERO)
+@jit
+def _spread_grain(  # noqa: C901, PLR0912 - a few passes over one tile
+    y: Real, left: Real, known: Mask, clipped: Mask, noise: Real, light: Real, out: Real
+) -> None:
+    """Fill `out` with what to add back of `left`; `known` marks the pixels that a colour was measured at."""
+    channels, rows, cols = y.shape
+    grain, weights = np.empty(channels, np.float32), np.empty(channels, np.float32)
+    for c in range(channels):
+        grain[c] = max(np.sqrt(noise[c, 0] * light[c] + noise[c, 1]) / light[c], np.float32(1e-9))
+        weights[c] = _LUMA[c] * np.sqrt(light[c])
+    weights /= weights.sum()
+    white = np.sqrt((weights * grain * grain).sum())
+    own = np.minimum(grain / white, ONE)
+    luma, fine = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    variance, coloured = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    there, share = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    for i in range(rows):
+        for j in range(cols):
+            total, square, hued, lost = ZERO, ZERO, ZERO, False
+            for c in range(channels):
+                power = (noise[c, 0] * max(y[c, i, j], ZERO) + noise[c, 1]) / (light[c] * light[c])
+                total += weights[c] * left[c, i, j] / light[c]
+                square += weights[c] * power
+                w = weights[c]
+                hued += _AVERAGED[c] * (ONE - w - w + np.float32(channels) * w * w) * power
+                lost = lost or clipped[c, i, j]
+            variance[i, j], coloured[i, j] = square, hued
+            there[i, j], luma[i, j] = ZERO if lost else ONE, ZERO if lost else total
+    smooth(there, _BINOMIAL, share, wrapped=False)
+    smooth(luma, _BINOMIAL, fine, wrapped=False)
+    for i in range(rows):
+        for j in range(cols):
+            mean = fine[i, j] / max(share[i, j], np.float32(1e-3))
+            fine[i, j] = luma[i, j] - mean if there[i, j] > ZERO else ZERO
+    _coarse(left, known, light, weights, out, luma)
+    _without_noise(out, coloured, share, there)
+    kept = _share_of_noise(fine, variance, share, there)
+    for i in range(rows):
+        for j in range(cols):
+            within = _GRAIN * np.sqrt(variance[i, j])
+            whole = kept[i, j] * min(max(fine[i, j], -within), within)
+            for c in range(channels):
+                out[c, i, j] = light[c] * (luma[i, j] + out[c, i, j] + own[c] * whole)
+        for k in range(channels):
+            for j in range(cols):
+                if not known[k, i, j]:
+                    continue
+                within = _GRAIN * np.sqrt(noise[k, 0] * max(y[k, i, j], ZERO) + noise[k, 1])
+                measured = (ONE - kept[i, j]) * min(max(left[k, i, j], -within), within) / light[k]
+                for c in range(channels):
+                    out[c, i, j] += measured * light[c] * min(ONE, grain[c] / grain[k])
+        for c in range(channels):
+            for j in range(cols):
+                if clipped[c, i, j]:
+                    out[c, i, j] = ZERO
 
-    ratio = _smoothed(fine * fine, _AROUND) / np.maximum(_smoothed(variance, _AROUND), np.float32(1e-20))
-    t = np.clip((ratio - _NOISE) / (_DETAIL - _NOISE), ZERO, ONE)
-    kept = ONE - t * t * (np.float32(3.0) - t - t)  # 1 where it is noise, 0 where it is detail
-    within = _GRAIN * np.sqrt(variance)
-    whole = kept * np.clip(fine, -within, within)
-    within = _GRAIN * np.sqrt(noise)
-    measured = known * (ONE - kept) * np.clip(left - means, -within, within) / bright
-    shares = np.minimum(grain[:, None] / grain, ONE)
-    own = np.minimum(grain / white, ONE)[:, None, None]
-    back = coarse + chroma + own * whole + np.tensordot(shares, measured, axes=1)
-    return np.asarray(np.where(clipped, ZERO, bright * back), dtype=np.float32)
+
+@jit
+def _coarse(left: Real, known: Mask, light: Real, weights: Real, chroma: Real, luma: Real) -> None:
+    """Local means of the measured residuals as luma and chroma, over the light; they are taken off `left`."""
+    channels, rows, cols = left.shape
+    mask, there = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    luma[:] = ZERO
+    for c in range(channels):
+        for i in range(rows):
+            for j in range(cols):
+                mask[i, j] = ONE if known[c, i, j] else ZERO
+                if not known[c, i, j]:
+                    left[c, i, j] = ZERO
+        smooth(mask, _BINOMIAL, there, wrapped=False)
+        smooth(left[c], _BINOMIAL, chroma[c], wrapped=False)
+        for i in range(rows):
+            for j in range(cols):
+                mean = chroma[c, i, j] / max(there[i, j], np.float32(1e-3))
+                left[c, i, j] -= mean
+                chroma[c, i, j] = mean / light[c]
+                luma[i, j] += weights[c] * chroma[c, i, j]
+    for c in range(channels):
+        for i in range(rows):
+            for j in range(cols):
+                chroma[c, i, j] -= luma[i, j]
+
+
+@jit
+def _without_noise(chroma: Real, noise: Real, power: Real, work: Real) -> None:
+    """Lower chroma as far as noise explains its power nearby, in place."""
+    channels, rows, cols = chroma.shape
+    for i in range(rows):
+        for j in range(cols):
+            square = ZERO
+            for c in range(channels):
+                square += chroma[c, i, j] * chroma[c, i, j]
+            work[i, j] = square
+    smooth(work, _AROUND, power, wrapped=False)
+    smooth(noise, _AROUND, work, wrapped=False)
+    for i in range(rows):
+        for j in range(cols):
+            share = max(ONE - _COLOURED * work[i, j] / max(power[i, j], np.float32(1e-20)), ZERO)
+            for c in range(channels):
+                chroma[c, i, j] *= share
+
+
+@jit
+def _share_of_noise(fine: Real, variance: Real, power: Real, work: Real) -> Real:
+    """1 where the power of `fine` nearby is that of noise, 0 where it is that of detail."""
+    rows, cols = fine.shape
+    kept = np.empty((rows, cols), np.float32)
+    for i in range(rows):
+        for j in range(cols):
+            work[i, j] = fine[i, j] * fine[i, j]
+    smooth(work, _AROUND, power, wrapped=False)
+    smooth(variance, _AROUND, work, wrapped=False)
+    span: Number = ONE / (_DETAIL - _NOISE)
+    for i in range(rows):
+        for j in range(cols):
+            ratio = power[i, j] / max(work[i, j], np.float32(1e-20))
+            t = min(max((ratio - _NOISE) * span, ZERO), ONE)
+            kept[i, j] = ONE - t * t * (np.float32(3.0) - t - t)
+    return kept

@@ -168,8 +168,8 @@ def correct_planes(
     within which to correct the photo, for a preview: they share the solution. `unguarded` returns what the
     method makes of the PSFs as they are, as in a paper's own experiments: not for photos to keep. Where
     cells gain less than `least_gain_db`, the photo stays as it is. Of a photo that a camera has sharpened and
-    compressed (`processed`), less is corrected the larger the error. `roi`, `(top, left, height, width)`, is a
-    part with the same pixels as the whole; `pitch` is the side of a cell in pixels.
+    compressed (`processed`), less is corrected the larger the error. `roi`, `(top, left, height, width)`, is
+    a part with the same pixels as the whole; `pitch` is the side of a cell in pixels.
     """
     if workers < 1:
         raise InvalidInputError(f"workers must be at least 1, got {workers}")

@@ -434,13 +434,17 @@ class StoredColour:
         alone: the finest detail of red and blue is that of luma, and colour that a correction adds to it
         comes from rounding and from errors of the kernels, and shows as coloured pixels.
         """
-        before = self._values(photo)
-        change = self._values(restored) - before
+        before, change = np.empty(photo.shape, np.float32), np.empty(photo.shape, np.float32)
+        _values(photo, self.tables, before)
+        _values(restored, self.tables, change)
+        change -= before
         for axis in (-2, -1):
             change = ndimage.convolve1d(change, _FINEST, axis=axis, mode="nearest")
         luma = np.tensordot(_LUMA, change, axes=1)
         # the same linear filter on all three differences: their weighted sum stays zero, and luma what it is
-        return self._light(before + luma + self.shown(change - luma))
+        chroma = self.shown(change - luma)
+        _light(before, luma, chroma, self.curves)
+        return before
 
     def shown(self, chroma: NDArray[np.float32]) -> NDArray[np.float32]:
         """Chroma `(..., rows, cols)` as finely as the file shows it."""
@@ -449,18 +453,28 @@ class StoredColour:
                 chroma = ndimage.convolve1d(chroma, _PAIRED, axis=axis, mode="nearest")
         return chroma
 
-    def _values(self, planes: Planes) -> Planes:
-        """File values of linear light, as `photo.colour.encode` finds them."""
-        roots = np.sqrt(np.clip(planes, ZERO, ONE))
-        return np.stack(
-            [
-                table[(root * np.float32(table.size - 1) + np.float32(0.5)).astype(np.int32)]
-                for table, root in zip(self.tables, roots, strict=True)
-            ]
-        )
 
-    def _light(self, values: Planes) -> Planes:
-        """Linear light of file values, between the codes of the curves."""
-        codes = [np.linspace(0.0, 1.0, curve.size) for curve in self.curves]
-        planes = [np.interp(*each) for each in zip(values, codes, self.curves, strict=True)]
-        return np.array(planes, dtype=np.float32)
+@jit
+def _values(planes: Planes, tables: Tables, out: Planes) -> None:
+    """File values of linear light, as `photo.colour.encode` finds them."""
+    for c in range(planes.shape[0]):
+        table = tables[c]
+        last = np.float32(table.size - 1)
+        for i in range(planes.shape[1]):
+            for j in range(planes.shape[2]):
+                light = min(max(planes[c, i, j], np.float32(0.0)), np.float32(1.0))
+                out[c, i, j] = table[np.int32(np.sqrt(light) * last + np.float32(0.5))]
+
+
+@jit
+def _light(values: Planes, luma: NDArray[np.float32], chroma: Planes, curves: Tables) -> None:
+    """Linear light of file values and their changes, between the codes of the curves, in place."""
+    for c in range(values.shape[0]):
+        curve = curves[c]
+        last = np.float32(curve.size - 1)
+        for i in range(values.shape[1]):
+            for j in range(values.shape[2]):
+                value = values[c, i, j] + luma[i, j] + chroma[c, i, j]
+                at = min(max(value, np.float32(0.0)), np.float32(1.0)) * last
+                k = min(np.int32(at), np.int32(curve.size - 2))
+                values[c, i, j] = curve[k] + (at - np.float32(k)) * (curve[k + 1] - curve[k])

@@ -28,8 +28,7 @@ class Settings(TypedDict, total=False):
     channel: Channel
 
 
-DEFAULT_SIZE = 55
-"""Side of a kernel in pixels (chosen): what a correction uses, so that the same numbers are seen."""
+DEFAULT_SIZE = 55  # pixels (chosen): side of a kernel that a correction uses, so that the same is seen
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -20,35 +20,27 @@ REBLUR, SPECTRUM, ISOLATED = "re-blur", "spectrum", "isolated pixels"
 
 _STANDS_OUT: Final = 1.5
 LIMITS: Final[Mapping[str, float]] = {REBLUR: 2.0, SPECTRUM: 2.0, ISOLATED: _STANDS_OUT}
-"""Figure of each check, in the unit of its own equation, from which a correction is held back (chosen: above
-what sound corrections of photographs reach)."""
+"""Figures, in the unit of each equation, from which a correction is held back (chosen)."""
 
 _MODEL_ERROR: Final = 0.3
-"""Share of what the blur changes that may remain on top of the noise: PSFs change within a tile, and prior
-and limit give way at edges (chosen)."""
+"""Share of what the blur changes that may remain: PSFs change, prior and limit give way at edges (chosen)."""
 _GLOW: Final = 0.005
-"""Share of the light of a clipped pixel; a pixel that receives more of it does not count: of a lamp the file
-holds no more than white, and a lamp is up to a hundred times brighter or so (chosen)."""
-_COARSE: Final = 4
-"""Distance of the second differences whose power lenses leave alone, pixels: 8 pixels a period (chosen)."""
+"""Share of a clipped pixel's light beyond which a pixel does not count: lamps are far brighter (chosen)."""
+_COARSE: Final = 4  # pixels: lenses leave the power of second differences at this distance alone
 _NOISE: Final = 4.0  # times the power of the noise below which no detail is seen (chosen)
 _SPIKE: Final = 12.0
-"""Standard deviations of noise by which a pixel may stand out in any case (chosen: of a million pixels some
-sixty stand out by 4; a correction amplifies noise three times before one is a fault)."""
+"""Standard deviations of noise by which any pixel may stand out (chosen: a correction amplifies noise three times)."""
 _ROOM: Final = 1.25  # factor for points that lie a part of a pixel beside the middle of theirs (chosen)
 _USUAL_GAIN: Final = 8.0  # of a point behind a PSF of one pixel, and the largest gain to assume
 
 _SIDE: Final = 8  # pixels of a block: that of a JPEG (ITU-T T.81)
 _WEIGHTS: Final = np.array([1, 2, 3, 4, 5, 4, 3, 2, 1], dtype=np.float32)
-"""Weights of the blocks around one, along rows and columns: a window that fades out (chosen). A wrong kernel
-is wrong all around; patches of different sharpness would show, and fewer pixels say less."""
+"""Weights of the blocks around one, along rows and columns: a window that fades out (chosen)."""
 _FOOT: Final = np.array([0.16, 0.5, 0.84, 1, 1, 1, 0.84, 0.5, 0.16], dtype=np.float32)
-"""Share of what is held back of a pixel that is held back of those beside it, along rows and columns (chosen:
-nothing of a faulty pixel comes back, and no edge shows)."""
+"""Share that is held back beside a faulty pixel, along rows and columns (chosen: no edge shows)."""
 
 HELD: Final = 0.1
-"""Share of a correction; a tile of which more was held back counts as held back (chosen: a hundredth is only
-just seen, a half only what is spoilt)."""
+"""Share of a correction from which on a tile counts as held back (chosen: a hundredth is only just seen)."""
 _MAPPED: Final = 0.01  # least share held back at which a tile is on the map (chosen: less is not seen)
 
 

@@ -318,8 +318,7 @@ def transfers(
 BLOCK: Final = 4  # pixels of a coarse plane's block: coarser than detail, finer than objects (chosen)
 
 _JOINT: Final = 4
-"""Pixels over which the ends of a tile fade into each other where its rim is cut off (chosen: with none, the
-step between the ends rings inwards; more is computed for nothing)."""
+"""Pixels over which the ends of a tile whose rim is cut off fade into each other (chosen: none would ring)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,13 +34,10 @@ from lensmodel.correction.posterior import PsfPosterior
 from lensmodel.photo.lateral import LateralColour
 
 _CELLS_PER_HALF_DIAGONAL: Final = 18.0
-"""Half the frame's diagonal over the side of a cell (chosen: cells of 200 pixels at 24 megapixels, over which
-a PSF hardly changes; more cells are mostly halo)."""
+"""Half diagonal over the side of a cell (chosen: 200 pixels at 24 megapixels, where a PSF hardly changes)."""
 _MIN_PITCH, _MAX_PITCH = 96, 208
 """Bounds of a cell's side in pixels: smaller ones are all halo, larger ones blur the PSF's change."""
-_RAMP: Final = 16
-"""Width in pixels over which neighbouring cells fade into each other (chosen: narrower, a seam may show
-between their PSFs; what is wider is computed twice)."""
+_RAMP: Final = 16  # pixels over which cells fade into each other (chosen: narrower, a seam may show)
 
 
 _Beside = tuple[FieldPosition, FieldPosition, float]
@@ -146,18 +143,13 @@ def _pieces(extent: int, pitch: int) -> list[tuple[int, NDArray[np.float32], flo
     return pieces
 
 
-_MIN_HALO, _MORE = 12, 6
-"""Least halo of a cell in pixels, and pixels beyond the reach of its blur: less costs quality."""
+_MIN_HALO, _MORE = 12, 6  # pixels: least halo of a cell, and beyond the reach of its blur; less costs quality
 _SHARE: Final = 0.87
-"""Share of what the prior took that is added back to full planes: three quarters of the power of the grain,
-so that with grain that the inverse of the blur amplifies it is no more than there was (chosen). Of a mosaic
-all comes back that `spread_grain` leaves, where a plan counts on as much: coloured grain stays away."""
+"""Share of what the prior took that comes back: three quarters of the power of its grain (chosen)."""
 _HALF, _BEST = 0.5, 0.25
-"""Error of a kernel at which half of the correction of a processed photo is made, and the least that counts
-(chosen: through a camera's processing none is known better). See `CorrectionJob.strength_at`."""
+"""Error of a kernel at which half is corrected of a processed photo, and the least that counts (chosen)."""
 _WINDOW, _NOISE, _TEXTURE = 7, 1.5, 4.0
-"""Side of the window in pixels in which what is unexplained is compared with the noise, and its power over
-that of the noise up to which it is noise, and from which it is texture (chosen: more than chance makes)."""
+"""Pixels; power over that of noise up to which what is unexplained is noise, from which texture (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,8 +33,7 @@ _TEXTURE: Final = np.float32(0.87)  # t, see `DirectFilter` (chosen as `cell._SH
 _LIGHT_STEPS, _OUTSIDE_STEPS = 15, 10
 """Steps that estimate the light of clipped pixels, and that from beyond the frame (chosen)."""
 _FLOOR: Final = np.float32(1e-3)
-"""Added to |K|²: the square of what a transfer function is expected to be off by within a cell (chosen:
-without it strong frequencies of the scene come back as coloured ripples)."""
+"""Squared error of K within a cell (chosen: without it strong frequencies come back as ripples)."""
 
 _SURE: Final = np.float32(2.0)
 """Times what a change costs in noise up to which none is made (chosen: less leaves grain in shadows)."""
@@ -42,9 +41,7 @@ _CAREFUL: Final = 3.0
 """Times its noise that a cell is filtered for (chosen: of 1, 3 and 8 the most that costs no gain)."""
 _EVERY: Final = 4  # of the rows and columns suffices for a mean
 _BLOCK: Final = 4  # pixels over which a change is compared with its noise: coarser than detail (chosen)
-_AROUND: Final = np.array([1.0, 4.0, 4.0, 4.0, 1.0], dtype=np.float32)
-"""Weights of the blocks around one, along rows and columns: a window of about 16 pixels (chosen: it holds
-enough pixels for a variance, and little of the next object)."""
+_AROUND: Final = np.array([1.0, 4.0, 4.0, 4.0, 1.0], dtype=np.float32)  # of blocks: 16 pixels (chosen)
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,11 +29,9 @@ natural image categories", Network 14, 2003, find 1.9 to 2.6 by category."""
 
 _EDGES: Final = (0.05, 0.08, 0.12, 0.17, 0.24)
 _MIDDLES: Final = np.sqrt(np.array(_EDGES[1:]) * _EDGES[:-1])
-"""Rings of frequencies to which a scene's power is fitted, cycles/pixel: above them demosaicing has a part in
-it (chosen)."""
+"""Rings of frequencies that scenes are fitted to, cycles/pixel: above, demosaicing has a part (chosen)."""
 
-_SLOPES: Final = (2.0, 5.0)
-"""Least and greatest slope a: of sharp photographs of detail, and of what is out of focus (chosen)."""
+_SLOPES: Final = (2.0, 5.0)  # of sharp detail, and of what is out of focus (chosen)
 
 _SOFT: Final = (3.0, 4.0)
 """Slopes between which a scene counts more and more as out of focus (chosen: detail in focus lies below)."""
@@ -163,21 +161,16 @@ def frequency_counts(shape: tuple[int, int]) -> Real:
     return counts
 
 
-WORTH_DB: Final = 0.1
-"""Expected gain below which a place is left as it is: a tenth of a decibel is not seen (chosen)."""
+WORTH_DB: Final = 0.1  # expected gain below which a place is left as it is: not seen (chosen)
 
 _SHARES: Final = np.array([1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1, 0.0], dtype=np.float32)
 """Shares of a kernel to try, the last if all others may harm; finer steps change the error by a hundredth."""
 
-_SHARPER: Final = 3.0
-"""Standard deviations z by which the true kernel may be narrower where a scene is out of focus (chosen: with
-2, twice as many blocks of a photo out of focus lose by a lens that is known from one such photo)."""
+_SHARPER: Final = 3.0  # sigmas of width tried out of focus (chosen: with 2, twice as many such blocks lose)
 
 _EVERY: Final = 3  # of the rows and columns suffices for a mean; odd, to meet all colours of a mosaic
 _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
-_MOST: Final = 0.7
-"""Largest share of a mosaic's error that a change is credited with removing (chosen: no correction takes all
-of it away, and a change that is larger than the error did something else)."""
+_MOST: Final = 0.7  # of a mosaic's error that a change is credited with (chosen: none takes all of it away)
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,46 +26,30 @@ from lensmodel.photo.colour import curves_of, inverse
 Mask = NDArray[np.bool_]
 
 _REACH: Final = 2
-"""Radius in pixels of the window whose light bounds a pixel (chosen: within one pixel only the blur of a thin
-line is seen and not its surroundings; further away lies another object)."""
+"""Radius of the light that bounds a pixel (chosen: within 1 only a line's blur, further another object)."""
 _LEVEL: Final = 0.1
 """Share of the range within which pixels belong to the level beside an edge (chosen: far more than noise)."""
 _LINE_SHARE, _EDGE_SHARE = 0.12, 0.25
-"""Share of a window that lies at the level of a line, and of an edge (chosen: a line narrower than its blur
-is as bright as its middle over a tenth of a window, an edge over a quarter at least)."""
+"""Share of a window at the level of a line, and of an edge (chosen: a line is narrower than its blur)."""
 _PURER: Final = 0.01
-"""By how much a colour's share of the light may leave the range nearby where the kernel is unsure (chosen:
-colours that blur has washed out get purer; with twice as much, a block more of foliage loses half a decibel,
-with none cars get dots). The surer, the more, as for lines: else a true kernel gains up to 1.2 dB less."""
+"""By how much a colour's share may leave the range nearby (chosen: twice as much gives dots)."""
 _COLOURLESS: Final = 0.05
-"""Share of the brightest light nearby that is added as grey to what lends its colour: what is far darker
-shows none beside it (chosen)."""
-_OWN_COLOURLESS: Final = 0.02
-"""The same for the pixel itself where the kernel is unsure (chosen: with more, black letters get green)."""
+"""Share of the brightest light nearby that is added as grey: what is far darker shows no colour (chosen)."""
+_OWN_COLOURLESS: Final = 0.02  # the same for the pixel itself (chosen: with more, black letters get green)
 _TINY: Final = 1e-5  # light, as seen, below which there is none
 _MOST: Final = 12  # pixels of a blur's reach beyond which levels beside an edge are of other things (chosen)
-_LAMP: Final = 2.0
-"""Solved light, in units of saturation, from which a pixel counts as a lamp although the photo did not clip
-(chosen: edges overshoot by less, lamps that the blur has dimmed are brighter)."""
+_LAMP: Final = 2.0  # saturations from which solved light is a lamp (chosen: edges overshoot by less)
 _PLATEAU: Final = 3
 """Pixels beyond the blur's reach that hold the level beside an edge (chosen: about as many as its width)."""
-_SURE: Final = 0.24
-"""Error of a kernel at which a result may leave the photo's range by the width of that range (chosen: the
-least that costs no gain behind a lens that is known to a quarter)."""
+_SURE: Final = 0.24  # error of a kernel that allows one range of room (chosen: the least that costs no gain)
 _MOST_ROOM: Final = 4.0
-"""Ranges by which a line may leave the photo's where the kernel is known well (chosen: the least with which
-dark lines behind exact kernels come back)."""
+"""Ranges of room at most (chosen: the least with which dark lines behind exact kernels return)."""
 _EDGE, _UNSURE = 0.06, 0.1
-"""Share of the range by which a result may leave the level beside an edge, and error of the kernel up to
-which more is allowed (chosen: half of what shows as a halo; the other half is left to grain)."""
-_EXACT: Final = 0.02
-"""Least error of a kernel that is reckoned with: none is known better over a whole tile (chosen)."""
+"""Share of the range beyond an edge, half a visible halo; error of a kernel below which it grows (chosen)."""
+_EXACT: Final = 0.02  # least error of a kernel: none is known better over a whole tile (chosen)
 _FREE: Final = 1e6  # stands for no bound where infinity would make sums undefined
-_DARKEST: Final = 0.5
-"""Share of the darkest light nearby that remains where the kernel is unsure (chosen: one stop)."""
-_SIGMAS: Final = 3.0
-"""Standard deviations of the noise in the dark that are added as grey as well (chosen: below, noise decides
-which colour is the largest)."""
+_DARKEST: Final = 0.5  # of the darkest light nearby remains where the kernel is unsure (chosen: one stop)
+_SIGMAS: Final = 3.0  # of the noise in the dark, added as grey (chosen: below, noise decides on the colour)
 
 
 @dataclass(frozen=True, slots=True)

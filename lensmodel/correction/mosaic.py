@@ -18,30 +18,18 @@ from lensmodel.correction.expected_gain import wiener_spectrum
 Mask = NDArray[np.bool_]
 
 _WINDOW: Final = 2.0
-"""Standard deviation in pixels of the windows in which a colour is a straight line over green: about ten
-of red or blue, few enough for a line and enough against noise (chosen). Gaussian, because a square holds
-more or fewer of them depending on where it begins, which shows as the mosaic's pattern beside
-coloured edges."""
+"""Sigma in pixels of windows: ten of red or blue each (chosen; squares would show the mosaic's pattern)."""
 _RIDGE: Final = np.float32(0.02)
-"""Share of the squared mean light of a window that is added to the variance of green in it: where green
-is flat, the slope is that of a constant hue (chosen)."""
+"""Share of squared light added to the variance of green: where it is flat, hue is constant (chosen)."""
 _GAUSSIAN: Final = np.exp(-0.5 * (np.arange(-8, 9) / _WINDOW) ** 2).astype(np.float32)
-_BETWEEN: Final = np.array([0.25, 0.5, 0.25], dtype=np.float32)
-"""Bilinear interpolation over every second pixel, once divided by the same filter of the mask."""
+_BETWEEN: Final = np.array([0.25, 0.5, 0.25], dtype=np.float32)  # bilinear
 
-_GRAIN: Final = np.float32(2.5)
-"""Standard deviations of the noise within which a residual is grain (chosen: noise exceeds them in one pixel
-of 400; further out, it is an error of the PSF that must not be added back)."""
-_LUMA: Final = np.array([0.25, 0.6, 0.15], dtype=np.float32)
-"""Weights of the colours of a camera in the light that is seen: those of Rec. 709 after a usual matrix."""
-_NOISE, _DETAIL = np.float32(0.4), np.float32(0.7)
-"""Power of the demosaiced grain over that of the sensor's noise, up to which it is noise, and from which it
-is detail that demosaicing made (chosen: in even places nine of ten have .1 to .45)."""
-_AVERAGED: Final = np.array([0.3, 0.15, 0.3], dtype=np.float32)
-"""Noise power of the mean of a Bayer mosaic's colours under `_BINOMIAL`: one over the pixels in it."""
+_GRAIN: Final = np.float32(2.5)  # sigmas within which a residual is grain (chosen: further out, the PSF errs)
+_LUMA: Final = np.array([0.25, 0.6, 0.15], dtype=np.float32)  # Rec. 709 after a usual matrix
+_NOISE, _DETAIL = np.float32(0.4), np.float32(0.7)  # demosaiced over sensor's power (chosen)
+_AVERAGED: Final = np.array([0.3, 0.15, 0.3], dtype=np.float32)  # one over the pixels under `_BINOMIAL`
 _COLOURED: Final = np.float32(0.5)
-"""Times its noise that the power of a coloured residual is lowered by (chosen: of .5, .75 and 1 the most that
-takes no colour from leaves)."""
+"""Times its noise by which coloured power is lowered (chosen: keeps the colour of leaves)."""
 _BINOMIAL: Final = np.array([1.0, 4.0, 6.0, 4.0, 1.0], dtype=np.float32) / np.float32(16.0)
 _AROUND: Final = np.full(7, 1.0 / 7.0, dtype=np.float32)
 

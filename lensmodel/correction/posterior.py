@@ -23,10 +23,8 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import otf
 from lensmodel.core.types import Channel, FieldPosition, Kernel
 
-GRID: Final = (64, 64)
-"""Shape of the grid whose `rfft2` frequencies variances are given on."""
-WIDEST: Final = 63
-"""Largest side of a kernel that the grid holds."""
+GRID: Final = (64, 64)  # pixels: variances are given at its `rfft2` frequencies
+WIDEST: Final = 63  # pixels: side of the largest kernel that the grid holds
 _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
 
 

@@ -37,25 +37,14 @@ Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 _Response: TypeAlias = tuple[Real, Number, Number]
 
 _ACCELERATIONS: Final = get_args(Acceleration)
-_ALPHA_MAX: Final = 0.9
-"""Cap of the fixed extrapolation; above it the noise is accelerated as well."""
-_SHARPNESS: Final = 50.0
-"""a of the sensor response, per clipping level: how sharply it bends where it clips (chosen: the bend is then
-a tenth of the level wide; a sharper one gives steps no slope to follow, a softer one bends what the sensor
-records in proportion)."""
+_ALPHA_MAX: Final = 0.9  # of the fixed extrapolation; above it the noise is accelerated as well
+_SHARPNESS: Final = 50.0  # a of the sensor response: it bends over a tenth of the clipping level (chosen)
 _REACH_FLOOR: Final = 0.05
-"""Least F^T 1, as a share of its largest value: see `first_guess` (chosen: a pixel with less of its light
-in the frame would be divided by little, and noise would explode; with more, the rim would be too dark)."""
+"""Share of the largest F^T 1, the least to divide by (chosen: less lets noise explode, more darkens rims)."""
 _LIGHT: Final = 0.9
-"""Share of the clipping level above which a sharp pixel counts as a light (chosen: blur leaves the rim of a
-light a little below the level; much lower, ordinary bright places would be treated as lights)."""
-_TINY: Final = np.float32(1e-6)
-"""Least light that is divided by, in units of saturation (chosen: far below the noise of any sensor, far
-above what single precision cannot divide by)."""
-_LEAST_PREDICTED: Final = np.float32(0.1)
-"""Least prediction as a share of the datum, so that a step raises light tenfold at most (chosen): a transfer
-function that belongs to no positive kernel, such as that of a point moved by a part of a pixel, predicts zero
-or negative light here and there."""
+"""Share of the clipping level above which a sharp pixel is a light: blur dims its rim a little (chosen)."""
+_TINY: Final = np.float32(1e-6)  # saturations: least light to divide by (chosen: far below noise)
+_LEAST_PREDICTED: Final = np.float32(0.1)  # of the datum: a step raises light tenfold at most (chosen)
 _SOFT: Final = special.softmax(-(np.arange(-10, 11) ** 2) / 18.0).astype(np.float32)
 """Weights that soften the places of lights: a Gaussian of 3 pixels (chosen)."""
 
@@ -349,30 +338,19 @@ def _steps(  # noqa: C901 - one pass over memory per loop
 Mask = NDArray[np.bool_]
 Window = tuple[slice, slice]
 
-LEAST_CLIPPED: Final = 0.98
-"""Share of the clipping level from which light may have clipped: demosaicing leaves it a little below, and
-sensors do not clip at one level (chosen)."""
+LEAST_CLIPPED: Final = 0.98  # of the clipping level: demosaicing leaves clipped light a little below (chosen)
 _LEAST_SEEN: Final = 0.02
-"""Least share of a point's light that counts as measured (chosen: a step divides by it, so that with less a
-few pixels of noise would make a light of any strength; with more, broad lights would come up too slowly)."""
-_UNSEEN: Final = 1e-3
-"""Share of a point's light below which it is unknown (chosen: no more than the kernel's far wings, which are
-known no better)."""
+"""Least share of a point's light to divide by (chosen: with less, noise makes lights of any strength)."""
+_UNSEEN: Final = 1e-3  # of a point's light: below it is unknown (chosen: the kernel's far wings)
 _SIGMAS: Final = np.float32(3.0)
-"""Standard deviations of noise by which glow may exceed the photo (chosen: noise alone exceeds it in one
-pixel of 700; with less, chance would dim the lights; with more, their glow would leave holes)."""
+"""Standard deviations by which glow may exceed the photo (chosen: with less, chance dims lights)."""
 _ABSURD: Final = np.float32(2.0)
 """Times that bound beyond which the glow is no answer (chosen: steps that converge leave less)."""
 
-_DARKEST: Final = 0.9
-"""Least share of the darkest light nearby that remains, times what a kernel spreads (chosen: 1 would allow no
-dark detail in a glow at all, much less the dark ring that it is there to prevent)."""
+_DARKEST: Final = 0.9  # share of the darkest light nearby that remains, times what a kernel spreads (chosen)
 _DUBIOUS: Final = np.float32(0.25)
-"""Share of the glow that may be scene light instead (chosen: 0 lets an error of the glow make a black ring, 1
-would leave all glow in place)."""
-_GLARE, _NO_GLARE = np.float32(0.5), np.float32(0.02)
-"""Share of glow in the photo's light at and above which the bound holds in full (chosen: from there on more
-of a pixel is subtracted than is left), and share of that below which it is rounding errors of transforms."""
+"""Share of the glow that may be scene light (chosen: 0 lets an error make a black ring)."""
+_GLARE, _NO_GLARE = np.float32(0.5), np.float32(0.02)  # glow in the light: bound in full, and none (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -527,10 +505,7 @@ def _believable(excess: Real, bound: Real, blur: UniformBlur) -> tuple[Real, Rea
     return excess, glow
 
 
-_DEPTH, _MORE = 4, 8
-"""Depth of the strip of data that predicts what lies beyond a side: so many reaches of the blur, plus so many
-pixels (chosen: those within two reaches share light with the outside, as many again share it with them; more
-costs time and says nothing of the outside)."""
+_DEPTH, _MORE = 4, 8  # reaches of the blur, and pixels: strip that predicts what lies beyond a side (chosen)
 
 
 def fill_canvas(

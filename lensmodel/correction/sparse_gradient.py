@@ -44,8 +44,7 @@ _DEGREE: Final = (
 _LARGEST: Final = 24.0  # argument, in widths of the shrinkage: beyond, hardly anything is taken off (chosen)
 _REACH: Final = np.float32(1.0 / _LARGEST)
 _RAMP: Final = 0.1
-"""Share of the jump over which the answer rises from 0 instead (chosen: with none, rounding decides what is
-kept, and steps that follow make a visible pixel of it; a wide one is no longer the prior's own answer)."""
+"""Share of the jump over which the answer rises (chosen: with none, rounding makes visible pixels)."""
 
 
 Prox = tuple[Number, Number, Real]
@@ -270,25 +269,17 @@ _OPPONENT: Final = np.array(
     ],
     dtype=np.float32,
 )
-_LIGHT_STEPS: Final = 20
-"""Steps that estimate the light of clipped pixels, and that from beyond the frame (chosen)."""
+_LIGHT_STEPS: Final = 20  # for the light of clipped pixels, and for that beyond the frame (chosen)
 _TYPICAL_CONTRAST: Final = np.float32(0.02)
-"""Variance over squared light of a scene for which kappa is `weight` (chosen: detail of a seventh of the
-light. It only sets the unit of `weight`; see `_BUSIEST`, `_CALMEST` for how far others lie)."""
+"""Variance over squared light at which kappa is `weight`: its unit."""
 _SCENE: Final = 0.2
-"""Least variance over squared light of a cell when its determined share is asked for (chosen: that of a scene
-with objects of all brightnesses; with less, flat cells would count as undetermined, and the prior would leave
-them their noise)."""
+"""Least variance over squared light for the determined share (chosen: else flat cells keep noise)."""
 # See `_reliance` (chosen on lenses of development seeds: measured once, no command repeats it)
 _OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4
 # Range of the weight of the prior between texture and flat places (chosen on the same lenses, as those)
 _BUSIEST, _CALMEST = 0.7, 50.0
-_DARK: Final = np.float32(0.02)
-"""Share of a tile's mean light below which the prior stops following it (chosen: with none, all detail of
-black would be smoothed away; with more, shadows keep noise that lighter places lose)."""
-_UNSURE: Final = np.float32(0.1)
-"""Share of the noise that a variance over so few pixels cannot resolve, and that counts as signal (chosen: at
-0, places without detail would be smoothed without limit)."""
+_DARK: Final = np.float32(0.02)  # of a tile's mean light, below which the prior stops following it (chosen)
+_UNSURE: Final = np.float32(0.1)  # of the noise, counted as signal: few pixels do not resolve it (chosen)
 
 
 @dataclass(frozen=True, slots=True)

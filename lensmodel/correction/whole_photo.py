@@ -65,12 +65,9 @@ deconvolvers: Registry[Deconvolver] = Registry(
 """The deconvolution methods by name."""
 
 KERNEL_SIZE: Final = 55  # pixels: the largest kernel that the paper estimates
-_ENOUGH_CELLS, _MORE_CELLS = 24, 96
-"""Cells to try of a photo (chosen): a tenth of the work, sure to `_SURE_DB`; more where too few decide."""
+_ENOUGH_CELLS, _MORE_CELLS = 24, 96  # to try of a photo: a tenth of the work; where too few decide (chosen)
 _SURE_DB: Final = 0.1
-_KEPT: Final = 640
-"""Kernels to keep: each serves its own cell and its neighbours; these are three rows of cells of 100
-megapixels."""
+_KEPT: Final = 640  # kernels to keep: three rows of cells of 100 megapixels
 
 _UNKNOWN: Final = 1.0
 """Expected error of a kernel at and above which no gain is predicted: all its power may be error (chosen)."""

@@ -44,19 +44,14 @@ _FLOOR_R, _FLOOR_PHI = 0.02, 0.12  # least bandwidths: blur does not change fast
 _SAME = 1e-6  # equal values have a spread of rounding errors, not of zero
 _PLACE_SHARE = 0.45  # of eq. 8: the rule is for densities, a smooth regression wants less
 
-MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
-"""Of the bandwidth by the rule: in steps of a root of two, in which errors hardly differ (chosen)."""
-PHI_MULTIPLES = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0, 20.0)
-"""The same around the centre; 20 means rotational symmetry, and 4 is halfway to it (chosen)."""
+MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)  # of the rule; errors hardly differ in between (chosen)
+PHI_MULTIPLES = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0, 20.0)  # 20 means rotational symmetry (chosen)
 _CAP = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
 _AS_GOOD, _NEGLIGIBLE = 1.01, 1e-3  # errors nearer than this are equal: their difference is noise (chosen)
-_CV_PHOTOS = 3
-"""Photos from which on leaving one out tells of bandwidths: of two, one would foretell one (chosen)."""
+_CV_PHOTOS = 3  # from which leaving one out tells of bandwidths: of two, one would foretell one (chosen)
 _CV_SAMPLES = 300  # that the search looks at: its cost grows with their square (chosen)
-_SCORED = 800
-"""Samples whose held-out error is measured, for the same reason; the others get the median (chosen)."""
-_ONE_FOCAL_LENGTH = 0.25
-"""Octaves within which focal lengths are one (chosen: over a fifth of it lenses hardly change)."""
+_SCORED = 800  # samples whose held-out error is measured; the others get the median (chosen: cost)
+_ONE_FOCAL_LENGTH = 0.25  # octaves (chosen: over a fifth of it lenses hardly change)
 _UNKNOWN_ERROR = 0.5  # of samples that no other one foretells (chosen: halfway to no knowledge)
 _FEWEST = 2  # one sample cannot be left out
 _TUKEY = 4.685  # 95 % efficiency for normal errors (P. J. Huber, "Robust Statistics", 1981: Tukey's biweight)

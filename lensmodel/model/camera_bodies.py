@@ -26,8 +26,7 @@ from lensmodel.core.types import FieldPosition, Kernel
 SAME = 0.005  # of the pitch: what rounding in metadata changes
 _PADDED = 2  # times the kernel, so that its images do not overlap
 _WIDEST = 8192  # pixels of the samples along a side: memory (chosen)
-ALIKE: Final = 0.03
-"""Relative difference of diagonals up to which two frames are one (chosen): pitches are rounded."""
+ALIKE: Final = 0.03  # relative difference up to which two diagonals are one (chosen): pitches are rounded
 
 
 def half_diagonal_mm(sample: PsfSample) -> float | None:

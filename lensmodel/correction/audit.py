@@ -29,7 +29,7 @@ _GLOW: Final = 0.005
 _COARSE: Final = 4  # pixels: lenses leave the power of second differences at this distance alone
 _NOISE: Final = 4.0  # times the power of the noise below which no detail is seen (chosen)
 _SPIKE: Final = 12.0
-"""Standard deviations of noise by which any pixel may stand out (chosen: a correction amplifies noise three times)."""
+"""Standard deviations of noise by which any pixel may stand out (chosen: corrections amplify noise)."""
 _ROOM: Final = 1.25  # factor for points that lie a part of a pixel beside the middle of theirs (chosen)
 _USUAL_GAIN: Final = 8.0  # of a point behind a PSF of one pixel, and the largest gain to assume
 

@@ -42,6 +42,7 @@ from lensmodel.photo.tiff import (
     Tags,
     TiffReader,
     Value,
+    Written,
     rationals,
     shorts,
     text,
@@ -411,30 +412,20 @@ def xmp_packet(metadata: PhotoMetadata, description: str, lens: str = "") -> byt
 # --- as EXIF tags of a written file -------------------------------------------------------------
 
 
-def main_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Value | None]:
-    """Tags of the main directory; names of people are UTF-8, as most programs read them."""
-    return {
-        0x010E: text(description),
-        0x010F: text(metadata.camera_maker),
-        0x0110: text(metadata.camera_model),
-        0x0112: shorts(metadata.orientation),
-        0x0131: text(SOFTWARE),
-        0x0132: _date(metadata.taken_at),
-        0x013B: text(metadata.artist, "utf-8"),
-        0x8298: text(metadata.copyright, "utf-8"),
-    }
+def written_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Value | Written | None]:
+    """Tags with those of EXIF: no maker notes, and serials only where the metadata have them.
 
-
-def exif_tags(metadata: PhotoMetadata) -> dict[int, Value | None]:
-    """Tags of the EXIF directory; no maker notes, and serials only where the metadata have them."""
+    Names of people are UTF-8, as most programs read them.
+    """
+    taken_at = text(metadata.taken_at.strftime("%Y:%m:%d %H:%M:%S")) if metadata.taken_at else None
     pitch = metadata.pixel_pitch_um
     per_cm = None if pitch is None else rationals(10_000.0 / pitch)
-    return {
+    exif = {
         0x829A: rationals(metadata.exposure_s),
         0x829D: rationals(metadata.aperture),
         0x8827: None if metadata.iso is None else shorts(min(round(metadata.iso), 65535)),
         0x9000: (UNDEFINED, b"0232"),  # ExifVersion
-        0x9003: _date(metadata.taken_at),
+        0x9003: taken_at,
         0x9206: rationals(metadata.focus_m),
         0x920A: rationals(metadata.focal_mm),
         0xA20E: per_cm,  # FocalPlaneXResolution
@@ -445,10 +436,17 @@ def exif_tags(metadata: PhotoMetadata) -> dict[int, Value | None]:
         0xA434: text(metadata.lens.model),
         0xA435: text(metadata.lens.serial),
     }
-
-
-def _date(value: datetime | None) -> Value | None:
-    return text(None if value is None else value.strftime("%Y:%m:%d %H:%M:%S"))
+    return {
+        0x010E: text(description),
+        0x010F: text(metadata.camera_maker),
+        0x0110: text(metadata.camera_model),
+        0x0112: shorts(metadata.orientation),
+        0x0131: text(SOFTWARE),
+        0x0132: taken_at,
+        0x013B: text(metadata.artist, "utf-8"),
+        0x8298: text(metadata.copyright, "utf-8"),
+        EXIF: exif,
+    }
 
 
 # --- location ---

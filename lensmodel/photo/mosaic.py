@@ -6,6 +6,7 @@ pixels beside a point of light get some of it, those beside a defect in smooth s
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import product
 from typing import Final, TypeAlias
@@ -104,8 +105,7 @@ class Mosaic:
 
     def repair(self) -> int:
         """Replace defective pixels in LibRaw's own memory, before it demosaics; return how many."""
-        near = Neighbours(self.colours, 2 if self.is_bayer else 6)
-        return replace_defects(self.values, defects(self.values, near), near)
+        return replace_defects(self.values, self.colours, 2 if self.is_bayer else 6)
 
     def saturation(self) -> tuple[int, tuple[float, float, float]]:
         """Level at which the sensor clips, and that of each colour relative to it, where clipped pixels pile.
@@ -192,6 +192,7 @@ _MOST: Final = 2e-3  # share of the pixels above which they are a picture, such 
 _NEIGHBOURS: Final = 8  # of the same colour
 _FILLED_FROM: Final = 4  # of them, the nearest (chosen): more lie across edges
 _REACH: Final = 4  # pixels to the farthest of them, in any mosaic that is read
+_RIM: Final = 6  # pixels by which a mosaic is continued: more than `_REACH`, and whole periods of any mosaic
 # Least height above all neighbours but one, not above their median: in standard deviations, and relative to
 # how much those that are left differ (chosen)
 _NEARLY: Final = (8.0, 0.75)
@@ -201,57 +202,64 @@ _QUIET: Final = 0.3  # share of a level's pixels, most like their neighbours, th
 _QUIET_HEIGHT: Final = 0.42  # their quantile of |N(0, 1 + pi / 16)|: white noise against a median of eight
 
 Places: TypeAlias = NDArray[np.int64]
-"""Pixels of a mosaic by their number, row by row; sorted."""
+"""Pixels of a mosaic that is continued beyond its rim, by their number, row by row."""
 
 
-class Neighbours:
-    """Which pixels of a mosaic are the nearest of the same colour, and which touch.
+def replace_defects(values: NDArray[np.uint16], colours: NDArray[np.uint8], period: int) -> int:
+    """Replace pixels that stand alone by the median of the nearest sound ones of their colour; say how many.
 
     `colours` are 0 red, 1 and 3 green, 2 blue, and repeat after `period` pixels, 2 or 6.
     """
+    near = Neighbours(values, colours, period)
+    places = defects(near)
+    around = near.of(places)
+    ring = np.where(np.isin(around, places), np.nan, near.values[around].astype(np.float32))
+    first = np.argsort(np.isnan(ring), axis=0, kind="stable")[:_FILLED_FROM]
+    ring = np.take_along_axis(ring, first, axis=0)
+    sound = ~np.isnan(ring).all(axis=0)
+    rows, cols = (index - _RIM for index in np.divmod(places[sound], near.width))
+    values[rows, cols] = np.rint(np.nanmedian(ring[:, sound], axis=0))
+    return len(rows)
 
-    def __init__(self, colours: NDArray[np.uint8], period: int) -> None:
-        self.shape, self.period = colours.shape, period
-        self.step = period * -(-_REACH // period)  # by which a place beyond the frame moves into it
+
+class Neighbours:
+    """A mosaic, continued beyond its rim by what lies whole periods inside, and like pixels in it."""
+
+    def __init__(self, values: NDArray[np.uint16], colours: NDArray[np.uint8], period: int) -> None:
+        self.shape, self.width = values.shape, values.shape[1] + 2 * _RIM
+        rows = np.concatenate([values[:_RIM], values, values[-_RIM:]])
+        self.values = np.concatenate([rows[:, :_RIM], rows, rows[:, -_RIM:]], axis=1).ravel()
         pattern = np.where(colours[:period, :period] == 3, 1, colours[:period, :period])
         around = np.array([at for at in product(range(-_REACH, _REACH + 1), repeat=2) if any(at)])
         around = around[np.argsort(np.square(around).sum(axis=1), kind="stable")]
-        self.alike = np.empty((period, period, _NEIGHBOURS, 2), dtype=np.int64)  # offsets, by distance
+        self.offsets = np.empty((period, period, _NEIGHBOURS), dtype=np.int64)  # by distance
         for row, col in np.ndindex(period, period):
             same = pattern[tuple((around + np.array([row, col])).T % period)] == pattern[row, col]
-            self.alike[row, col] = around[same][:_NEIGHBOURS]
-
-    def _at(self, places: Places, offsets: NDArray[np.integer]) -> Places:
-        """Places at offsets (places, n, 2); those beyond the frame move into it, the colour stays."""
-        length = np.array(self.shape)
-        index = np.stack(np.divmod(places, length[1]), axis=-1)[:, None] + offsets
-        index += self.step * ((index < 0).astype(np.int64) - (index >= length))
-        return (index[..., 0] * length[1] + index[..., 1]).T
+            self.offsets[row, col] = around[same][:_NEIGHBOURS] @ (self.width, 1)
 
     def of(self, places: Places) -> Places:
         """Nearest pixels of the same colour, shape (8, places), by distance."""
-        rows, cols = np.divmod(places, self.shape[1])
-        return self._at(places, self.alike[rows % self.period, cols % self.period])
+        rows, cols = (index % len(self.offsets) for index in np.divmod(places, self.width))
+        return (places[:, None] + self.offsets[rows, cols]).T
 
-    def touching(self, places: Places) -> Places:
-        """The pixels above, left, right and below, shape (4, places)."""
-        return self._at(places, np.array([(-1, 0), (0, -1), (0, 1), (1, 0)]))
+    def median(self, places: Places) -> NDArray[np.float32]:
+        """Median of the nearest pixels of the same colour."""
+        return np.median(self.values[self.of(places)].astype(np.float32), axis=0)
 
 
-def defects(values: NDArray[np.uint16], near: Neighbours) -> Places:
+def defects(near: Neighbours) -> Places:
     """Find the pixels of a mosaic that stand alone, brighter or darker than all around them."""
-    levels, deviations = _noise(values, near)
+    levels, deviations = _noise(near)
     least = (_NEARLY[0] * np.interp(np.arange(1 << 16), levels, deviations)).astype(np.float32)
-    flat, places = values.ravel(), np.flatnonzero(_standing_out(values, near.alike, near.step, least))
-    ring = flat[near.of(places)].astype(np.float32)
+    places = np.flatnonzero(_standing_out(near.values, near.offsets, near.width, least))
+    ring = near.values[near.of(places)].astype(np.float32)
     middle = np.median(ring, axis=0)
-    sign = np.sign(flat[places] - middle)
-    height = np.abs(flat[places] - middle)
+    sign = np.sign(near.values[places] - middle)
+    height = np.abs(near.values[places] - middle)
     apart = np.sort(np.abs(ring - middle), axis=0)
     sigma = np.maximum(np.interp(middle, levels, deviations), 1.4826 * apart[_NEIGHBOURS // 2])
-    beside = near.touching(places)
-    level = np.median(flat[near.of(beside.ravel())].astype(np.float32), axis=0).reshape(beside.shape)
-    bumps = sign * (flat[beside] - level)
+    touching = [places + step for step in (-near.width, -1, 1, near.width)]
+    bumps = np.stack([sign * (near.values[beside] - near.median(beside)) for beside in touching])
 
     def alone(sigmas: float, contrast: float, most_beside: float) -> Places:
         chosen = np.maximum(sigmas * sigma, contrast * apart[-1]) < height
@@ -259,30 +267,18 @@ def defects(values: NDArray[np.uint16], near: Neighbours) -> Places:
         return places[chosen & (np.abs(bumps).max(axis=0) < most_beside * height + 4.0 * sigma)]
 
     sure, likely = alone(*_SURE), alone(*_LIKELY)
-    if len(sure) > _MOST * values.size:
+    if len(sure) > _MOST * math.prod(near.shape):
         return places[:0]
     return likely if len(sure) > _MANY * len(np.setdiff1d(likely, sure)) else sure
 
 
-def replace_defects(values: NDArray[np.uint16], places: Places, near: Neighbours) -> int:
-    """Write the median of the nearest sound neighbours of its colour into each place; return how many."""
-    around = near.of(places)
-    ring = values[np.divmod(around, values.shape[1])].astype(np.float32)
-    ring[np.isin(around, places)] = np.nan
-    first = np.argsort(np.isnan(ring), axis=0, kind="stable")[:_FILLED_FROM]
-    ring = np.take_along_axis(ring, first, axis=0)
-    sound = ~np.isnan(ring).all(axis=0)
-    filled = np.rint(np.nanmedian(ring[:, sound], axis=0)).astype(values.dtype)
-    values[np.divmod(places[sound], values.shape[1])] = filled
-    return len(filled)
-
-
-def _noise(values: NDArray[np.uint16], near: Neighbours) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _noise(near: Neighbours) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Levels, and the standard deviation of the noise there, on the pixels most like their neighbours."""
-    places = np.arange(0, values.size, max(1, values.size // _SAMPLES) | 1)
-    flat = values.ravel()
-    middle = np.median(flat[near.of(places)].astype(np.float32), axis=0)
-    height = np.abs(flat[places] - middle)
+    size = math.prod(near.shape)
+    rows, cols = np.divmod(np.arange(0, size, max(1, size // _SAMPLES) | 1), near.shape[1])
+    places = (rows + _RIM) * near.width + cols + _RIM
+    middle = near.median(places)
+    height = np.abs(near.values[places] - middle)
     parts = np.array_split(np.argsort(middle, kind="stable"), _LEVELS)
     levels = [float(middle[part].mean()) for part in parts]
     sigma = [float(np.quantile(height[part], _QUIET)) / _QUIET_HEIGHT for part in parts]
@@ -291,23 +287,20 @@ def _noise(values: NDArray[np.uint16], near: Neighbours) -> tuple[NDArray[np.flo
 
 @jit
 def _standing_out(
-    values: NDArray[np.uint16], alike: NDArray[np.int64], step: int, least: NDArray[np.float32]
+    values: NDArray[np.uint16], offsets: NDArray[np.int64], width: int, least: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
     """Pixels that differ from all but one of their neighbours of the colour by more than those differ."""
-    height, width = values.shape
-    period = len(alike)
-    found = np.zeros((height, width), np.bool_)
-    for row in range(height):
-        for col in range(width):
+    period = len(offsets)
+    found = np.zeros(len(values), np.bool_)
+    for row in range(_RIM, len(values) // width - _RIM):
+        for col in range(_RIM, width - _RIM):
+            place = row * width + col
             high, second, second_low, low = 0, 0, 65535, 65535
-            for down, right in alike[row % period, col % period]:
-                i, j = row + down, col + right
-                i += step if i < 0 else -step if i >= height else 0
-                j += step if j < 0 else -step if j >= width else 0
-                one = int(values[i, j])
+            for offset in offsets[row % period, col % period]:
+                one = int(values[place + offset])
                 second, high = max(second, min(high, one)), max(high, one)
                 second_low, low = min(second_low, max(low, one)), min(low, one)
-            own = int(values[row, col])
+            own = int(values[place])
             need = max(_NEARLY[1] * max(second - second_low, 0), least[second])
-            found[row, col] = max(own - second, second_low - own) > need
+            found[place] = max(own - second, second_low - own) > need
     return found

@@ -11,15 +11,13 @@ from __future__ import annotations
 import math
 import mmap
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import BinaryIO, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-
-from lensmodel.core.errors import InvalidInputError
 
 Buffer: TypeAlias = bytes | mmap.mmap
 
@@ -171,8 +169,8 @@ class TiffReader:
 Value: TypeAlias = tuple[int, bytes]
 """Type and bytes of a tag to be written, little-endian."""
 
-Written: TypeAlias = Mapping[int, Value | None]
-"""Tags of a directory to be written; what is `None` is left out."""
+Written: TypeAlias = Mapping[int, "Value | Written | None"]
+"""Tags of a directory to be written, such as others below it; what is `None` or empty is left out."""
 
 
 def shorts(*values: int) -> Value:
@@ -191,34 +189,48 @@ def text(value: str | None, encoding: str = "ascii") -> Value | None:
 
 
 def rationals(*values: float | None) -> Value | None:
-    """Positive numbers as quotients; nothing unless all of them are known."""
-    parts = [_rational(value) for value in values if value is not None]
-    packed = b"".join(struct.pack("<2I", *part) for part in parts)
-    return (RATIONAL, packed) if len(parts) == len(values) else None
+    """Positive numbers as quotients, at most a millionth off; nothing unless all of them are known."""
+    packed = b""
+    for value in values:
+        if value is None:
+            return None
+        finite = min(value, _MAX_UINT32)  # by which EXIF writes infinity
+        part = Fraction(finite).limit_denominator(min(1_000_000, int(_MAX_UINT32 / max(finite, 1.0))))
+        packed += struct.pack("<2I", part.numerator, part.denominator)
+    return RATIONAL, packed
 
 
-def signed_rationals(values: Sequence[float]) -> Value:
+def signed_rationals(*values: float) -> Value:
     """Numbers as signed quotients."""
     parts = [Fraction(float(value)).limit_denominator(1_000_000) for value in values]
     return SRATIONAL, b"".join(struct.pack("<2i", part.numerator, part.denominator) for part in parts)
 
 
-def laid_out(main: Written, below: Mapping[int, Written]) -> bytes:
-    """Lay out a TIFF structure: its header, the main directory, and those that its tags point to."""
-    start = 8  # behind the header
-    children = {tag: directory for tag, directory in below.items() if any(directory.values())}
-    whole = {**main, **dict.fromkeys(children, longs(0))}
-    end, parts = start + len(_packed(whole, start)), []
-    for tag, directory in children.items():
-        parts.append(bytes(end % 2) + _packed(directory, end + end % 2))
-        whole[tag] = longs(end + end % 2)
-        end += len(parts[-1])
-    return struct.pack("<2sHI", b"II", 42, start) + _packed(whole, start) + b"".join(parts)
+def laid_out(tags: Written) -> bytes:
+    """Lay out a TIFF structure: its header, a directory, and those below it."""
+    return b"II*\0\x08\0\0\0" + _packed(tags, 8)
 
 
-def write_strip(
-    file: BinaryIO, tags: Written, below: Mapping[int, Written], pixels: NDArray[np.generic]
-) -> None:
+def _packed(directory: Written, offset: int) -> bytes:
+    """Lay a directory out to stand at `offset` of the file; long values and those below it right behind."""
+    entries = sorted((tag, value) for tag, value in directory.items() if value)
+    position = offset + 2 + ENTRY * len(entries) + 4
+    head, tail = struct.pack("<H", len(entries)), b""
+    for tag, value in entries:
+        tail += bytes(len(tail) % 2)  # values begin on a word boundary
+        place = position + len(tail)
+        if isinstance(value, Mapping):
+            (kind, data), behind = longs(place), _packed(value, place)
+        else:
+            kind, data = value
+            behind = data if len(data) > 4 else b""
+        head += struct.pack("<HHI", tag, kind, len(data) // _SIZES[kind])
+        head += struct.pack("<I", place) if behind else data.ljust(4, b"\0")
+        tail += behind
+    return head + bytes(4) + tail
+
+
+def write_strip(file: BinaryIO, tags: Written, pixels: NDArray[np.generic]) -> None:
     """Write a TIFF structure and the pixels `(row, col[, channel])`, as one strip that is not compressed."""
     height, width = pixels.shape[:2]
     samples = pixels.shape[2] if pixels.ndim == 3 else 1
@@ -234,33 +246,8 @@ def write_strip(
         279: longs(pixels.nbytes),
         284: shorts(1),  # interleaved
     }
-    at = len(laid_out(whole, below))
+    at = len(laid_out(whole))
     at += -at % 16
     whole[273] = longs(at)
-    file.write(laid_out(whole, below).ljust(at, b"\0"))
+    file.write(laid_out(whole).ljust(at, b"\0"))
     file.write(np.ascontiguousarray(pixels).astype(pixels.dtype.newbyteorder("<"), copy=False).data)
-
-
-def _packed(directory: Written, offset: int) -> bytes:
-    """Lay a directory out to stand at `offset` of the file, its longer values right behind it."""
-    values = sorted((tag, value) for tag, value in directory.items() if value is not None)
-    position = offset + 2 + 12 * len(values) + 4
-    head, tail = [struct.pack("<H", len(values))], b""
-    for tag, (kind, data) in values:
-        place = data.ljust(4, b"\0")
-        if len(data) > 4:
-            tail += bytes(len(tail) % 2)  # values begin on a word boundary
-            place = struct.pack("<I", position + len(tail))
-            tail += data
-        head.append(struct.pack("<HHI", tag, kind, len(data) // _SIZES[kind]) + place)
-    return b"".join(head) + bytes(4) + tail
-
-
-def _rational(value: float) -> tuple[int, int]:
-    """Quotient of a positive number, at most a millionth off; infinity as EXIF writes it."""
-    if math.isinf(value):
-        return _MAX_UINT32, 1
-    if not 0.0 <= value <= _MAX_UINT32:
-        raise InvalidInputError(f"{value} does not fit a TIFF rational")
-    part = Fraction(value).limit_denominator(min(1_000_000, int(_MAX_UINT32 / max(value, 1.0))))
-    return part.numerator, part.denominator

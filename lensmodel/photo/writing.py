@@ -5,7 +5,6 @@ Source: Adobe, "Digital Negative (DNG) Specification" 1.4, 2012, and 1.6, 2021 (
 
 from __future__ import annotations
 
-import math
 import struct
 import zlib
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from PIL import Image
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
+from lensmodel.core.names import full_name
 from lensmodel.core.types import BayerPattern, Planes
 from lensmodel.photo.colour import (
     D65_TO_D50,
@@ -35,10 +35,9 @@ from lensmodel.photo.colour import (
     matrix_profile,
     named_profile,
 )
-from lensmodel.photo.metadata import exif_tags, main_tags, xmp_packet
+from lensmodel.photo.metadata import written_tags, xmp_packet
 from lensmodel.photo.tiff import (
     BYTE,
-    EXIF,
     GPS,
     UNDEFINED,
     Written,
@@ -98,34 +97,31 @@ def write_image(
     path, metadata = Path(path), encoding.metadata.without_serials()
     if format.startswith("png"):
         metadata = replace(metadata, orientation=1)
-    main, below = main_tags(metadata, description), {EXIF: exif_tags(metadata), GPS: gps}
+    tags = {**written_tags(metadata, description), GPS: gps}
     xmp = xmp_packet(metadata, description, lens)
     _tell_losses(path.name, planes, encoding, format)
+    linear = format == "tiff32" and color_space == "same" and encoding.transfer == "linear"
+    target = _target(encoding, "camera-linear" if linear or format == "dng" else color_space)
+    pixels = _encoded(planes, target, {"tiff32": None, "jpeg": 255, "png8": 255}.get(format, 65535))
     with atomic(path) as file:
         if format == "dng":
-            tags = {**main, **_linear_dng_tags(encoding), _XMP_TAG: (BYTE, xmp)}
-            write_strip(file, tags, below, _sixteen_bits(planes))
-            return
-        if format == "tiff32" and color_space == "same" and encoding.transfer == "linear":
-            color_space = "camera-linear"
-        target = _target(encoding, color_space)
-        pixels = _encoded(planes, target, {"tiff32": None, "jpeg": 255, "png8": 255}.get(format, 65535))
-        if format == "jpeg":
-            exif = b"Exif\0\0" + laid_out(main, below)
+            write_strip(file, {**tags, **_linear_dng_tags(encoding), _XMP_TAG: (BYTE, xmp)}, pixels)
+        elif format == "jpeg":
+            exif = b"Exif\0\0" + laid_out(tags)
             options: dict[str, Any] = {"quality": quality, "subsampling": 0, "optimize": True}
             Image.fromarray(pixels).save(file, "JPEG", icc_profile=target.icc, exif=exif, xmp=xmp, **options)
         elif format.startswith("png"):
             chunks = {
                 b"iCCP": b"ICC\0\0" + zlib.compress(target.icc),
-                b"eXIf": laid_out(main, below),
+                b"eXIf": laid_out(tags),
                 b"iTXt": b"XML:com.adobe.xmp\0\0\0\0\0" + xmp,
             }
             _write_png(file, upright(pixels, encoding.metadata.orientation), chunks)
         else:
             sample_format = 1 if format == "tiff16" else 3  # whole numbers, or floating-point
-            tags = {262: shorts(2), 339: shorts(*(sample_format,) * 3)}  # RGB
+            of_rgb = {262: shorts(2), 339: shorts(*(sample_format,) * 3)}
             blocks = {_XMP_TAG: (BYTE, xmp), _ICC_TAG: (UNDEFINED, target.icc)}
-            write_strip(file, {**main, **tags, **blocks}, below, pixels)
+            write_strip(file, {**tags, **of_rgb, **blocks}, pixels)
 
 
 def _tell_losses(name: str, planes: Planes, encoding: Encoding, output: OutputFormat) -> None:
@@ -153,14 +149,14 @@ class _Target:
 
     gain: tuple[float, float, float]
     matrix: Matrix | None
-    curves: tuple[Curve, Curve, Curve]
+    curves: tuple[Curve, Curve, Curve] | None  # None: the numbers are light
     icc: bytes
 
 
 def _target(encoding: Encoding, color_space: ColorSpace) -> _Target:
     if color_space == "camera-linear":
         profile = linear_profile(_to_xyz_d50(encoding), "lensmodel linear")
-        return _Target((1.0, 1.0, 1.0), None, curves_of("linear"), profile)
+        return _Target((1.0, 1.0, 1.0), None, None, profile)
     icc = _rgb_profile(encoding)
     if encoding.to_srgb is None and icc is not None and color_space == "same":
         return _Target((1.0, 1.0, 1.0), None, curves_of(encoding.transfer, icc), icc)
@@ -194,7 +190,7 @@ def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
     _, height, width = planes.shape
     kind = {255: np.uint8, 65535: np.uint16, None: np.float32}[top]
     out: Pixels = np.empty((height, width, 3), dtype=kind)
-    tables = [inverse(curve) for curve in target.curves]
+    tables = None if target.curves is None else [inverse(curve) for curve in target.curves]
     gain = np.asarray(target.gain, dtype=np.float32)[:, None, None]
     for row in range(0, height, _ROWS):
         part = planes[:, row : row + _ROWS] * gain
@@ -202,10 +198,10 @@ def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
             np.clip(part, 0.0, 1.0, out=part)
         if target.matrix is not None:
             part = np.tensordot(target.matrix.astype(np.float32), part, axes=1)
-        for k, table in enumerate(tables):
-            numbers = encode(part[k], table)
+        for k, light in enumerate(part):
+            numbers = light if tables is None else encode(light, tables[k])
             if top is None:  # as `decode` takes them
-                numbers = np.where((part[k] < 0.0) | (part[k] > 1.0), part[k], numbers)
+                numbers = np.where((light < 0.0) | (light > 1.0), light, numbers)
             else:
                 numbers = np.rint(numbers * np.float32(top))
             out[row : row + _ROWS, :, k] = numbers
@@ -213,15 +209,6 @@ def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
 
 
 # --- files -------------------------------------------------------------------------------------
-
-
-def _sixteen_bits(planes: Planes) -> Pixels:
-    """Linear numbers `(row, col, channel)` of 16 bits."""
-    out = np.empty((*planes.shape[1:], 3), dtype=np.uint16)
-    for row in range(0, len(out), _ROWS):
-        part = np.clip(planes[:, row : row + _ROWS], 0.0, 1.0)
-        out[row : row + _ROWS] = np.rint(part * np.float32(65535)).transpose(1, 2, 0)
-    return out
 
 
 def _linear_dng_tags(encoding: Encoding) -> Written:
@@ -291,14 +278,8 @@ def write_bayer_dng(
     baseline_exposure: float | None = None,
 ) -> None:
     """Write a raw mosaic as an uncompressed DNG; the file appears whole or not at all."""
-    if mosaic.ndim != 2 or mosaic.dtype != np.uint16 or mosaic.shape[0] % 2 or mosaic.shape[1] % 2:
-        raise InvalidInputError(f"a mosaic is uint16 with even sides, got {mosaic.dtype} {mosaic.shape}")
-    if pattern not in BAYER_PATTERNS:
-        raise InvalidInputError(f"pattern must be one of {', '.join(BAYER_PATTERNS)}, got {pattern!r}")
-    if not 0 <= black < white <= 65535:
-        raise InvalidInputError(f"levels must satisfy 0 <= black < white <= 65535, got {black}, {white}")
     tags = {
-        **main_tags(metadata, description),
+        **written_tags(metadata, description),
         **dng_tags(metadata, color_matrix, as_shot_neutral, baseline_exposure),
         262: shorts(32803),  # PhotometricInterpretation: a colour filter array (TIFF/EP)
         33421: shorts(2, 2),  # CFARepeatPatternDim
@@ -309,7 +290,7 @@ def write_bayer_dng(
         50717: shorts(white),
     }
     with atomic(Path(path)) as file:
-        write_strip(file, tags, {EXIF: exif_tags(metadata)}, mosaic)
+        write_strip(file, tags, mosaic)
 
 
 def dng_tags(
@@ -319,23 +300,17 @@ def dng_tags(
     baseline_exposure: float | None,
 ) -> Written:
     """Tags that make a TIFF a DNG: its version, camera and colours."""
-    matrix = np.asarray(color_matrix, dtype=np.float64)
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        raise InvalidInputError(f"the colour matrix must be 3 x 3 and finite, got {matrix.shape}")
-    if len(as_shot_neutral) != 3 or not all(math.isfinite(v) and v > 0 for v in as_shot_neutral):
-        raise InvalidInputError(f"the neutral must be three positive numbers, got {tuple(as_shot_neutral)}")
-    # Most models carry their maker already; programs look cameras up by this name.
-    maker, model = metadata.camera_maker or "", metadata.camera_model or ""
-    unique = model if model.lower().startswith(maker.lower()) else f"{maker} {model}"
+    # programs look cameras up by this name
+    unique = full_name(metadata.camera_maker, metadata.camera_model) or "Unknown"
     return {
         254: longs(0),  # NewSubfileType: the full image
         50706: (BYTE, bytes((1, 4, 0, 0))),  # DNGVersion
         50707: (BYTE, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
-        50708: text(unique.strip() or "Unknown"),  # UniqueCameraModel
+        50708: text(unique),  # UniqueCameraModel
         50713: shorts(1, 1),  # BlackLevelRepeatDim
-        50721: signed_rationals(matrix.ravel().tolist()),  # ColorMatrix1
+        50721: signed_rationals(*np.ravel(color_matrix)),  # ColorMatrix1
         50728: rationals(*as_shot_neutral),
-        50730: None if baseline_exposure is None else signed_rationals([baseline_exposure]),
+        50730: None if baseline_exposure is None else signed_rationals(baseline_exposure),
         50735: text(metadata.body_serial),  # CameraSerialNumber
         50778: shorts(21),  # CalibrationIlluminant1: D65, in the numbers of Exif's LightSource
     }

@@ -154,7 +154,7 @@ def test_every_mosaic_that_is_not_demosaiced_here_is_refused(
 ) -> None:
     pattern = bytes("RGBCMYW".index(letter) for letter in colours)
     tags = {256: longs(64), 257: longs(48), 33421: shorts(rows, columns), 33422: (BYTE, pattern)}
-    (tmp_path / "x.dng").write_bytes(laid_out({**tags, 50706: (BYTE, b"\1\4\0\0")}, {}))
+    (tmp_path / "x.dng").write_bytes(laid_out({**tags, 50706: (BYTE, b"\1\4\0\0")}))
 
     with pytest.raises(UnsupportedFormatError, match=f"{rows} x {columns} pixels"):
         photo.inspect(tmp_path / "x.dng")
@@ -573,7 +573,7 @@ def test_one_number_of_a_huge_tag_unpacks_no_other() -> None:
 @pytest.mark.parametrize("version", [None, (BYTE, b"\1\4\0\0")], ids=["tiff", "dng"])
 def test_a_size_that_is_no_whole_number_is_no_size(tmp_path: Path, version: Value | None) -> None:
     double = (12, struct.pack("<d", 1e300))
-    (tmp_path / "x").write_bytes(laid_out({256: double, 257: double, 50706: version}, {}))
+    (tmp_path / "x").write_bytes(laid_out({256: double, 257: double, 50706: version}))
 
     with pytest.raises(LensModelError):
         photo.inspect(tmp_path / "x")

@@ -463,24 +463,6 @@ def test_every_tag_comes_back_and_unknown_ones_are_left_out(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"mosaic": mosaic(63, 96)}, "even sides"),
-        ({"pattern": "RGBW"}, "pattern"),
-        ({"black": 100}, "black < white"),
-        ({"color_matrix": np.eye(2)}, "3 x 3"),
-        ({"as_shot_neutral": (0.0, 1.0, 1.0)}, "positive"),
-    ],
-    ids=str,
-)
-def test_wrong_arguments_are_refused(change: dict[str, Any], text: str, tmp_path: Path) -> None:
-    given: dict[str, Any] = {"mosaic": mosaic(), "black": 0, "white": 100, **change}
-    with pytest.raises(InvalidInputError, match=text):
-        write_bayer_dng(tmp_path / "no.dng", **given)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
     ("maker", "model", "unique"),
     [("Maker", "Body 1", "Maker Body 1"), ("Maker", "Maker Body 1", "Maker Body 1"), ("", "Body", "Body")],
 )

@@ -42,7 +42,7 @@ from lensmodel.model import LensModel
 from lensmodel.model.profile import read_profile
 from lensmodel.neural import FieldNetwork
 from lensmodel.patches import Patch, selectors
-from lensmodel.patches.windows import Rejection
+from lensmodel.patches.select import Rejection
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.photo.metadata import find_location
 from lensmodel.report import lens_report

@@ -30,7 +30,7 @@ from lensmodel.core.types import FieldPosition, Frame, LensSettings, NoiseModel,
 from lensmodel.patches.good_regions import FEATURES, TreeEnsemble, features_of
 from lensmodel.patches.rmap import RMapSelector
 from lensmodel.patches.select import first_reasons
-from lensmodel.patches.windows import BLOCKS_A_SIDE, details_of, measure_blocks, windows_of
+from lensmodel.patches.windows import BLOCKS_A_SIDE, details_of, windows_of
 from lensmodel.simulate import draw_lens
 
 SIZE: Final = 192  # pixels of a window: that of a calibration
@@ -61,8 +61,8 @@ def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[La
     blurred = signal.fftconvolve(scene_of(photo)[1].astype(np.float64), kernel, mode="valid")
     plane = (blurred + rng.normal(0.0, sigma, blurred.shape)).astype(np.float32)
     noise = NoiseModel.white(sigma)
-    blocks = measure_blocks(plane, noise, SIZE // BLOCKS_A_SIDE, 1.0, ignore_step)
-    windows = windows_of(blocks, Frame(*plane.shape), noise)
+    frame = Frame(*plane.shape)
+    windows = windows_of(plane, frame, noise, SIZE // BLOCKS_A_SIDE, 1.0, ignore_step)
     usable = np.flatnonzero(first_reasons(windows) == "")
     if usable.size < WINDOWS_A_GROUP:
         return

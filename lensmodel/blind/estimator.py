@@ -12,7 +12,8 @@ import numpy as np
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, centred, resized
 from lensmodel.core.types import Kernel, LensSettings, NoiseModel, Plane, StepHook, ignore_step
-from lensmodel.patches.windows import Patch, Selection, repeats
+from lensmodel.patches import Patch, Selection
+from lensmodel.patches.windows import repeats
 from lensmodel.photo.values import LinearPhoto
 
 _MIN_SIDE = 64  # pixels: one tile of a patch's spectrum

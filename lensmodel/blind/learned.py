@@ -27,8 +27,7 @@ from lensmodel.core.types import (
 )
 from lensmodel.neural import Conditions, FieldNetwork
 from lensmodel.neural.statistics import WINDOW, patch_statistics, to_octant
-from lensmodel.patches.select import spread_evenly
-from lensmodel.patches.windows import Patch, Selection
+from lensmodel.patches.select import Patch, Selection, spread_evenly
 from lensmodel.photo.values import LinearPhoto
 
 _DEVELOPED_NOISE: Final = NoiseModel(shot=0.0, read=1e-6)  # of developed planes in the training

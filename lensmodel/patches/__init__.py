@@ -5,12 +5,14 @@ from lensmodel.patches.select import (
     LEAST_PARTS,
     LEAST_PATCHES,
     SMALLEST_PATCH,
+    Patch,
+    Reason,
+    Selection,
     Selector,
     require_enough,
     select,
     selectors,
 )
-from lensmodel.patches.windows import Patch, Reason, Selection
 
 __all__ = [
     "LEAST_PARTS",

@@ -29,12 +29,12 @@ def smoothed_gradients(plane: Plane) -> tuple[Plane, Plane, Plane]:
     return smooth, along_rows, along_cols
 
 
-def gradient_noise(sigma: float) -> float:
-    """Standard deviation of one smoothed gradient component for white noise of `sigma`, a linear filter."""
+def gradient_noise() -> float:
+    """Standard deviation of one smoothed gradient component for white noise of 1, by the filter itself."""
     impulse = np.zeros((17, 17), dtype=np.float32)
     impulse[8, 8] = 1.0
     _, response, _ = smoothed_gradients(impulse)
-    return sigma * math.sqrt(float(np.square(response, dtype=np.float64).sum()))
+    return math.sqrt(float(np.square(response, dtype=np.float64).sum()))
 
 
 def r_of_gradients(along_rows: Plane, along_cols: Plane, size: Plane, scale: float) -> Plane:

@@ -1,8 +1,8 @@
 """Choose the windows of a photo that tell about the PSF: by the r-map, or by learned good regions.
 
-`spread_windows` keeps of scored windows the best ones that lie apart: non-maximum suppression, quotas, cells
-of the field. `spread_evenly`, for the learned estimator, moves one window in each of equal cells to where
-detail is richest; flat and clipped ones alone are left out, for the network weighs its patches.
+`_spread` keeps of scored windows the best ones that lie apart: non-maximum suppression, quotas, cells of the
+field. `spread_evenly`, for the learned estimator, moves one window in each of equal cells to where detail is
+richest; flat and clipped ones alone are left out, for the network weighs its patches.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import Final, Protocol
+from dataclasses import dataclass
+from typing import Final, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,28 +23,21 @@ from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, Frame, NoiseModel, Plane, StepHook, ignore_step, zone_of
 from lensmodel.patches.good_regions import GoodRegionsSelector
 from lensmodel.patches.rmap import RMapSelector, edge_score
-from lensmodel.patches.windows import (
-    BLOCKS_A_SIDE,
-    MAX_REJECTIONS,
-    Details,
-    Patch,
-    Reason,
-    Rejection,
-    Selection,
-    Windows,
-    details_of,
-    measure_blocks,
-    windows_of,
-)
+from lensmodel.patches.windows import BLOCKS_A_SIDE, Details, Windows, details_of, windows_of
 from lensmodel.photo.values import LinearPhoto
 
 logger = logging.getLogger(__name__)
 
+Reason: TypeAlias = Literal[
+    "border", "clipped", "dark", "flat", "one-directional", "periodic", "jpeg-blocks", "duplicate"
+]
+"""Why a window was not taken; `duplicate` means that a better one lies too near or the quota is full."""
+
 SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
+MAX_REJECTIONS: Final = 2000  # a photo has ten thousand windows; a report needs no more than this
 CLIPPED_LIMIT: Final = 0.005  # share of a window's pixels (chosen): a few specular points do little harm
-BLOB_LIMIT: Final = (
-    20  # connected clipped pixels: a larger area has an edge whose profile is cut off (chosen)
-)
+# Connected clipped pixels (chosen): a larger area has an edge whose profile is cut off
+BLOB_LIMIT: Final = 20
 DARK_LIMIT: Final = 0.5  # share of a window's pixels: the other half still has edges (chosen)
 FLAT_CONTRAST: Final = 4.0  # variance of signal over noise: below, noise decides the estimate (chosen)
 FLAT_EIGENVALUE: Final = 10.0  # smaller eigenvalue of the structure tensor over that of noise (chosen)
@@ -64,6 +58,37 @@ _ADVICE: Final[dict[str, str]] = {
     "jpeg-blocks": "use the RAW file or a higher JPEG quality",
     "border": "crop the empty border away",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A window of a photo that tells about the PSF."""
+
+    row: int  # top-left pixel
+    col: int
+    size: int  # side in pixels
+    position: FieldPosition  # of the window's centre
+    score: float  # how much it tells, 0 to 1
+    cell: int  # number of the field cell; patches of one cell may share one kernel
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """A window that was not taken, and why."""
+
+    row: int
+    col: int
+    size: int
+    reason: Reason
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """The outcome of patch selection on one plane."""
+
+    patches: tuple[Patch, ...]  # ordered by cell, the best of each cell first
+    # at most `MAX_REJECTIONS` of them, spread evenly over the photo and the reasons
+    rejected: tuple[Rejection, ...]
 
 
 class Selector(Protocol):
@@ -104,52 +129,45 @@ def select(
         raise InvalidInputError(f"the plane is {plane.shape}, the frame {frame.height} x {frame.width}")
     if count < 1:
         raise InvalidInputError(f"count must be at least 1, got {count}")
-    chooser = selectors.resolve(selector)
-    side = _block_side(frame, size)
-    windows = windows_of(measure_blocks(plane, noise, side, clip, on_step), frame, noise)
+    if size < SMALLEST_PATCH:
+        raise InvalidInputError(f"patches need at least {SMALLEST_PATCH} px, got {size}")
+    chooser, shorter = selectors.resolve(selector), min(frame.height, frame.width)
+    _require_room(frame, SMALLEST_PATCH)
+    fitting = min(size, max(shorter // 4, min(shorter, 2 * SMALLEST_PATCH)))
+    windows = windows_of(plane, frame, noise, fitting // BLOCKS_A_SIDE, clip, on_step)
     reasons = first_reasons(windows)
     usable = np.flatnonzero(reasons == "")
-    short = usable[shortlist(windows.take(usable), edge_score(windows)[usable], SHORTLIST_A_SECTOR)]
-    reasons[np.setdiff1d(usable, short)] = "duplicate"
-    chosen: list[tuple[int, int]] = []
-    score = np.zeros(len(windows))
+    short = usable[_shortlist(windows.take(usable))]
+    reasons[usable] = "duplicate"
     if short.size:
         looked = details_of(plane, windows.take(short), clip, coarse_noise)
-        reasons[short] = second_reasons(looked)
-        fine = reasons[short] == ""
-        left = short[fine]
-        score[left] = chooser.score(windows.take(left), looked.take(fine))
-        if left.size:
-            picks = spread_windows(windows.take(left), score[left], count)
-            chosen = [(int(left[i]), cell) for i, cell in picks]
-    if not chosen:
+        reasons[short] = _second_reasons(looked)
+        looked = Details(*(part[reasons[short] == ""] for part in looked))
+        short = short[reasons[short] == ""]
+    if not short.size:
         raise NoUsablePatchesError(_nothing_usable(Counter(reasons.tolist())))
-    taken = np.array([i for i, _ in chosen])
-    reasons[np.setdiff1d(np.flatnonzero(reasons == ""), taken)] = "duplicate"
-    reasons[taken] = ""
-    weight = JPEG_WEIGHT if jpeg else 1.0
+    score = chooser.score(windows.take(short), looked)
+    order = np.argsort(-score, kind="stable")
+    short, score = short[order], score[order] * (JPEG_WEIGHT if jpeg else 1.0)
+    reasons[short] = "duplicate"
     patches = []
-    for i, cell in chosen:
-        position = FieldPosition(min(float(windows.r[i]), 1.0), float(windows.phi[i]))
-        corner = int(windows.rows[i]), int(windows.cols[i])
-        patches.append(Patch(*corner, windows.size, position, float(score[i]) * weight, cell))
+    for number, cell in enumerate(_spread(windows.take(short), count)):
+        for i, told in zip(short[cell], score[cell], strict=True):
+            position = FieldPosition(min(float(windows.r[i]), 1.0), float(windows.phi[i]))
+            corner = int(windows.rows[i]), int(windows.cols[i])
+            patches.append(Patch(*corner, windows.size, position, float(told), number))
+            reasons[i] = ""
     counts = Counter(reason for reason in reasons.tolist() if reason)
     logger.info("chose %d of %d windows; rejected: %s", len(patches), len(windows), dict(counts))
     return Selection(tuple(patches), _rejections(windows, reasons))
 
 
-def _block_side(frame: Frame, size: int) -> int:
-    """Side of the blocks of windows of `size` pixels, or of those that fit."""
-    if size < SMALLEST_PATCH:
-        raise InvalidInputError(f"patches need at least {SMALLEST_PATCH} px, got {size}")
-    shorter = min(frame.height, frame.width)
-    if shorter < SMALLEST_PATCH:
+def _require_room(frame: Frame, size: int) -> None:
+    if min(frame.height, frame.width) < size:
         raise NoUsablePatchesError(
-            f"the photo is {frame.width} x {frame.height} px, a patch needs {SMALLEST_PATCH}; "
+            f"the photo is {frame.width} x {frame.height} px, a patch needs {size}; "
             "use the photo in its full size"
         )
-    fitting = max(shorter // 4, min(shorter, 2 * SMALLEST_PATCH))
-    return min(size, fitting) // BLOCKS_A_SIDE
 
 
 def first_reasons(windows: Windows) -> NDArray[np.str_]:
@@ -165,7 +183,7 @@ def first_reasons(windows: Windows) -> NDArray[np.str_]:
     )
 
 
-def second_reasons(looked: Details) -> NDArray[np.str_]:
+def _second_reasons(looked: Details) -> NDArray[np.str_]:
     """Reason of each window from its own pixels; empty where none holds."""
     return _first(
         ("clipped", looked.blob > BLOB_LIMIT),
@@ -192,13 +210,10 @@ def _rejections(windows: Windows, reasons: NDArray[np.str_]) -> tuple[Rejection,
 
 
 def _nothing_usable(counts: Counter[str]) -> str:
-    total = sum(counts.values())
-    if total == 0:
-        return "no part of the photo is large enough for a patch; use the photo in its full size"
     reason, times = counts.most_common(1)[0]
     listed = ", ".join(f"{name} {number}" for name, number in counts.most_common())
     return (
-        f"none of {total} windows is usable ({listed}); {times} are rejected as {reason}: "
+        f"none of {counts.total()} windows is usable ({listed}); {times} are rejected as {reason}: "
         f"{_ADVICE.get(reason, 'use another photo')}"
     )
 
@@ -216,71 +231,72 @@ SPREAD_STEP: Final = 1.0  # window sides: nearer windows share pixels (chosen)
 MOST_STEPS: Final = 4  # window sides to the nearest seed that count; beyond, the better one wins (chosen)
 
 
-def shortlist(windows: Windows, score: NDArray[np.float64], most_a_sector: int) -> NDArray[np.intp]:
-    """Best windows of every ring and octant that keep half a window's distance from each other."""
+def _shortlist(windows: Windows) -> list[int]:
+    """Windows with the best edges of every ring and octant that lie half a window apart, in their order."""
     ring, octant = _sector_of(windows)
-    room = np.full((RINGS, OCTANTS), most_a_sector)
-    chosen: list[int] = []
+    room = np.full((RINGS, OCTANTS), SHORTLIST_A_SECTOR)
     free = np.ones(len(windows), dtype=bool)
-    for i in _by_score(windows, score):
+    chosen: list[int] = []
+    for i in np.argsort(-edge_score(windows), kind="stable").tolist():
         if free[i] and room[ring[i], octant[i]] > 0:
-            chosen.append(int(i))
+            chosen.append(i)
             room[ring[i], octant[i]] -= 1
-            free &= _distance(windows, int(i)) >= windows.size / 2.0
-    return np.array(chosen, dtype=np.intp)
+            apart = np.maximum(abs(windows.rows - windows.rows[i]), abs(windows.cols - windows.cols[i]))
+            free &= apart >= windows.size / 2.0
+    return sorted(chosen)
 
 
-def spread_windows(windows: Windows, score: NDArray[np.float64], count: int) -> list[tuple[int, int]]:
-    """Choose up to `count` windows in field cells: their numbers, and those of their cells.
+def _spread(windows: Windows, count: int) -> list[list[int]]:
+    """Choose up to `count` windows, given best first, and group them by field cells.
 
     First the seeds, one a cell; then every cell in turn takes its best remaining neighbour, up to four.
     """
-    order = _by_score(windows, score)
+    rows, cols, r, phi = (
+        part[:, None] - part for part in (windows.rows, windows.cols, windows.r, windows.phi)
+    )
+    apart = np.maximum(abs(rows), abs(cols)) / windows.size  # window sides, along the axis with more of them
+    turn = abs((phi + math.pi) % (2.0 * math.pi) - math.pi)
+    close = (apart < 1.0) | ((turn <= CELL_ANGLE) & (apart <= MOST_APART))
+    of_one_cell = close & (abs(r) <= CELL_R)
     # Half a window's distance between any two chosen; a whole one between the seeds, if there is room.
-    cells = [[seed] for seed in _seeds(windows, order, math.ceil(count / PATCHES_A_CELL))]
-    free = np.ones(len(windows), dtype=bool)
-    for (seed,) in cells:
-        free &= _distance(windows, seed) >= windows.size / 2.0
+    cells = [[seed] for seed in _seeds(windows, apart, math.ceil(count / PATCHES_A_CELL))]
+    left, free = count - len(cells), (apart[[seed for (seed,) in cells]] >= 0.5).all(axis=0)
 
     def best(among: NDArray[np.bool_]) -> int | None:
-        found = order[(free & among)[order]]
-        return int(found[0]) if found.size and sum(map(len, cells)) < count else None
+        nonlocal left
+        found = np.flatnonzero(free & among)
+        if not (found.size and left):
+            return None
+        left -= 1
+        free[apart[found[0]] < 0.5] = False
+        return int(found[0])
 
-    def put(window: int, members: list[int]) -> None:
-        members.append(window)
-        np.logical_and(free, _distance(windows, window) >= windows.size / 2.0, out=free)
-
-    for members in cells * (MOST_A_CELL - 1):
-        window = best(_same_cell(windows, members[0]))
-        if window is not None:
-            put(window, members)
+    for cell in cells * (MOST_A_CELL - 1):
+        if (window := best(of_one_cell[cell[0]])) is not None:
+            cell.append(window)
     while (window := best(free)) is not None:  # one that is near no cell founds its own
-        near = (m for m in cells if len(m) < MOST_A_CELL and _same_cell(windows, m[0])[window])
-        home = next(near, None)
-        if home is None:
+        near = (cell for cell in cells if len(cell) < MOST_A_CELL and of_one_cell[cell[0], window])
+        if (home := next(near, None)) is None:
             cells.append(home := [])
-        put(window, home)
-    return [(i, number) for number, members in enumerate(cells) for i in members]
+        home.append(window)
+    return cells
 
 
-def _seeds(windows: Windows, order: NDArray[np.intp], count: int) -> list[int]:
+def _seeds(windows: Windows, apart: NDArray[np.float64], count: int) -> list[int]:
     """First windows of cells, from the rings and octants that have the fewest so far."""
     ring, octant = _sector_of(windows)
     # The rings share by area, as far as the photo has anything there: the model needs the corners.
     share = (np.arange(RINGS) + 0.5) * (np.bincount(ring, minlength=RINGS) > 0)
-    share /= share.sum()
     in_sector = np.zeros((RINGS, OCTANTS), dtype=np.intp)
     nearest = np.full(len(windows), np.inf)
     seeds: list[int] = []
-    while len(seeds) < count and (nearest >= windows.size).any():
-        left = order[nearest[order] >= windows.size]
-        fullness = in_sector.sum(axis=1) / np.maximum(share, 1e-9)
-        steps = np.minimum(nearest[left] / (SPREAD_STEP * windows.size), MOST_STEPS).astype(np.intp)
+    while len(seeds) < count and (left := np.flatnonzero(nearest >= 1.0)).size:
+        fullness = in_sector.sum(axis=1) / np.maximum(share / share.sum(), 1e-9)
+        steps = np.minimum(nearest[left] / SPREAD_STEP, MOST_STEPS).astype(np.intp)
         key = np.lexsort((-steps, fullness[ring[left]], in_sector[ring[left], octant[left]]))
-        best = int(left[key[0]])  # of equal ones the first, the best: the sort is stable
-        seeds.append(best)
-        in_sector[ring[best], octant[best]] += 1
-        nearest = np.minimum(nearest, _distance(windows, best))
+        seeds.append(int(left[key[0]]))  # of equal ones the first, the best: the sort is stable
+        in_sector[ring[seeds[-1]], octant[seeds[-1]]] += 1
+        nearest = np.minimum(nearest, apart[seeds[-1]])
     return seeds
 
 
@@ -289,23 +305,6 @@ def _sector_of(windows: Windows) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     ring = np.minimum((windows.r * RINGS).astype(np.intp), RINGS - 1)
     octant = np.floor(windows.phi * (OCTANTS / (2.0 * math.pi))).astype(np.intp) % OCTANTS
     return ring, octant
-
-
-def _by_score(windows: Windows, score: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Best first; equal scores by place, so that the order never depends on chance."""
-    return np.lexsort((windows.cols, windows.rows, -score))
-
-
-def _distance(windows: Windows, i: int) -> NDArray[np.int64]:
-    """Pixels from one window to each, along the axis on which they are farther apart."""
-    return np.maximum(np.abs(windows.rows - windows.rows[i]), np.abs(windows.cols - windows.cols[i]))
-
-
-def _same_cell(windows: Windows, i: int) -> NDArray[np.bool_]:
-    turn = np.abs((windows.phi - windows.phi[i] + math.pi) % (2.0 * math.pi) - math.pi)
-    apart = _distance(windows, i)
-    close = (apart < windows.size) | ((turn <= CELL_ANGLE) & (apart <= MOST_APART * windows.size))
-    return close & (np.abs(windows.r - windows.r[i]) <= CELL_R)
 
 
 _BLOCK: Final = 16  # pixels: a window is eight of them along a side (chosen)
@@ -319,11 +318,7 @@ _MOVES: Final = (-0.8, -0.4, 0.0, 0.4, 0.8)  # within the room of a cell: neighb
 def spread_evenly(developed: LinearPhoto, *, count: int, size: int) -> Selection:
     """Choose at most `count` windows of side `size`, the same ones always."""
     frame = developed.frame
-    if min(frame.height, frame.width) < size:
-        raise NoUsablePatchesError(
-            f"the photo is {frame.width} x {frame.height} px, a patch needs {size}; "
-            "use the photo in its full size"
-        )
+    _require_room(frame, size)
     ratio, clipped = _blocks(developed)
     patches: list[Patch] = []
     rejected: list[Rejection] = []

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from lensmodel.core.types import Frame, NoiseModel, Plane, ignore_step
 from lensmodel.patches.good_regions import FEATURES, GoodRegionsSelector, TreeEnsemble, features_of
-from lensmodel.patches.windows import Details, Windows, details_of, measure_blocks, windows_of
+from lensmodel.patches.windows import Details, Windows, details_of, windows_of
 
 SIGMA = 0.004
 NOISE = NoiseModel.white(SIGMA)
@@ -27,8 +27,7 @@ def plane_of(seed: int, height: int = 320, width: int = 384) -> Plane:
 
 
 def looked_at(plane: Plane) -> tuple[Windows, Details]:
-    blocks = measure_blocks(plane, NOISE, 32, 1.0, ignore_step)
-    windows = windows_of(blocks, Frame(*plane.shape), NOISE)
+    windows = windows_of(plane, Frame(*plane.shape), NOISE, 32, 1.0, ignore_step)
     return windows, details_of(plane, windows, 1.0)
 
 
@@ -79,7 +78,7 @@ def test_trees_are_evaluated_as_written_down() -> None:
 
 def test_a_window_with_detail_scores_above_the_same_window_in_heavy_noise() -> None:
     windows, details = looked_at(plane_of(3))
-    noisy = dataclasses.replace(details, information=details.information - np.log(100.0))
+    noisy = details._replace(information=details.information - np.log(100.0))
     loud = dataclasses.replace(
         windows,
         directions=windows.directions / 100.0,

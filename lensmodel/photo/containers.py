@@ -48,18 +48,14 @@ class Header:
     height: int = 0
     channels: int = 0  # samples of a pixel; 0 unknown
     compression: int = 1  # TIFF tag 259; 1 is none
-    directory: int = 0  # offset of the directory of a TIFF's picture; 0 where it is not said which
+    directory: int = 0  # offset of the directory of the picture of a TIFF or DNG; 0 where there is none
     tiff: tuple[TiffReader, ...] = ()  # TIFF structures with EXIF in them
     camera: tuple[str, str] | None = None  # maker and model of a CRW file, which has no TIFF structure
     xmp: bytes | None = None
-    icc: bytes | None = None
-    icc_lost: bool = False  # whether there is an ICC profile that cannot be read at all
+    icc: bytes | None = None  # empty where there is a profile that cannot be read at all
     # median step of the quantised cosine coefficients of luma in a JPEG, or in the tiles of a lossy DNG, in
     # 8-bit numbers; 0 unknown, or not compressed so
     coarseness: float = 0.0
-    white: tuple[int, ...] = ()  # WhiteLevel of a DNG, of all channels or of each
-    opcodes_2: bytes = b""  # OpcodeList2 and 3 of a DNG
-    opcodes_3: bytes = b""
     chroma_step: tuple[int, int] = (1, 1)  # rows and columns that share one value of a JPEG's chroma
     whole: bool = True  # false where the file ends before its picture does
 
@@ -256,8 +252,8 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
         raise TruncatedImageError("the PNG has no image data")
     exif, text = TiffReader.open(found.get(b"eXIf", b"")), found.get(b"iTXt", b"")
     xmp = text[20:].partition(b"\0")[2].partition(b"\0")[2]
-    icc = _inflated(found[b"iCCP"].partition(b"\0")[2][1:]) if b"iCCP" in found else None
-    if icc is None or found.get(b"cICP", b"")[1:2] in _HDR:
+    icc = (_inflated(found[b"iCCP"].partition(b"\0")[2][1:]) or b"") if b"iCCP" in found else None
+    if not icc or found.get(b"cICP", b"")[1:2] in _HDR:
         _require_srgb(found)
     return Header(
         "png",
@@ -267,7 +263,6 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
         tiff=() if exif is None else (exif,),
         xmp=_inflated(xmp) if text[18:19] == b"\1" else xmp,
         icc=icc,
-        icc_lost=icc is None and b"iCCP" in found,
     )
 
 
@@ -325,7 +320,7 @@ def _inflated(packed: bytes) -> bytes | None:
 
 _ICC: Final = 34675  # tag of the profile: ICC.1:2022, annex B.4
 _DNG_VERSION: Final = 0xC612  # tag, DNG 1.6, chapter 4
-_LOSSY: Final = 34892  # compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"
+LOSSY_DNG: Final = 34892  # compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"
 _STRIPS: Final = (273, 324), (279, 325)  # tags of the places of strips and of tiles, and of their lengths
 _RAW_COMPRESSION: Final = {32767, 32769, 32770, 34713, 65000, 65535}  # Sony to Pentax: libtiff, tiff.h
 _FILTERS: Final = "RGBCMYW"  # CFAPattern: TIFF/EP, section 5.2.1
@@ -355,45 +350,38 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
     elif any(t.integer(262) in _RAW_PHOTOMETRIC or t.integer(259) in _RAW_COMPRESSION for _, t in every):
         kind = "raw"
     place, photo = max(every, key=lambda at: (kind != "tiff" or not _is_derived(at[1]), _pixels(at[1])))
+    starts, lengths = (photo.integers(strip if strip in photo else tile) for strip, tile in _STRIPS)
     header = Header(
         kind,
         width=photo.integer(256),
         height=photo.integer(257),
         channels=photo.integer(277, 1),
         compression=photo.integer(259, 1),
+        directory=0 if kind == "raw" else place,
         tiff=(reader,),
-        xmp=_block(first, 700),
+        xmp=first.raw(700)[:MAX_BLOCK_BYTES],
+        icc=photo.raw(_ICC)[:MAX_BLOCK_BYTES] if _ICC in photo else None,
+        whole=kind == "raw" or all(at + n <= len(buffer) for at, n in zip(starts, lengths, strict=False)),
     )
     check_size(header.width, header.height, len(buffer), limits)
-    if kind == "tiff":
-        if len(every) >= MAX_DIRECTORIES:
-            raise UnsupportedFormatError(
-                f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo"
-            )
-        if not _pixels(photo) or not all(photo.keys() & either for either in _STRIPS):
-            raise NotAnImageError(
-                f"the TIFF gives no size ({header.width} x {header.height}) or no strips: it holds no picture"
-            )
-        _check_numbers(photo)  # first: chroma that is stored for several pixels looks cut off
-        _check_strips(photo, len(buffer))
-        icc = _block(photo, _ICC)
-        return replace(header, directory=place, icc=icc, icc_lost=_ICC in photo and icc is None)
-    _check_mosaic(photo)
-    if kind == "raw":
+    if kind != "tiff":
+        _check_mosaic(photo)
+        if header.compression != LOSSY_DNG:
+            return header
+        tile = buffer[starts[0] : starts[0] + min(lengths[0], MAX_BLOCK_BYTES)] if starts and lengths else b""
+        with contextlib.suppress(NotAnImageError, TruncatedImageError):
+            return replace(header, coarseness=_read_jpeg(tile, Limits()).coarseness)  # the first for all
         return header
-    lossy = header.compression == _LOSSY
-    return replace(
-        header,
-        opcodes_2=_block(photo, 51009) or b"",
-        opcodes_3=_block(photo, 51022) or b"",
-        whole=_strips(photo, len(buffer))[2],
-        coarseness=_coarseness_of_tiles(buffer, photo) if lossy else 0.0,
-        white=() if lossy else photo.integers(50717, 3),  # LibRaw stretches those itself
-    )
-
-
-def _block(tags: Tags, tag: int) -> bytes | None:
-    return tags.raw(tag)[:MAX_BLOCK_BYTES] or None
+    if len(every) >= MAX_DIRECTORIES:
+        raise UnsupportedFormatError(f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo")
+    if not _pixels(photo) or not all(photo.keys() & either for either in _STRIPS):
+        raise NotAnImageError(
+            f"the TIFF gives no size ({header.width} x {header.height}) or no strips: it holds no picture"
+        )
+    _check_numbers(photo)
+    stored = _pixels(photo) * header.channels * photo.integer(258, 1) / 8
+    missing = header.compression == 1 and sum(lengths) < 0.999 * stored
+    return replace(header, whole=header.whole and 0 < len(starts) == len(lengths) and not missing)
 
 
 def _pixels(tags: Tags) -> int:
@@ -423,35 +411,6 @@ def _check_mosaic(tags: Tags) -> None:
         filters = tags.raw(33422)[:256]
         letters = "".join(_FILTERS[number] if number < len(_FILTERS) else "?" for number in filters)
         require_known_mosaic([letters[k * shape[1] : (k + 1) * shape[1]] for k in range(shape[0])])
-
-
-def _coarseness_of_tiles(buffer: Buffer, tags: Tags) -> float:
-    """Step of the quantised coefficients of a DNG by its first JPEG tile, which speaks for all; 0 unknown."""
-    at, size = (tags.integer(tile) or tags.integer(strip) for strip, tile in _STRIPS)
-    with contextlib.suppress(NotAnImageError, TruncatedImageError):
-        return _read_jpeg(buffer[at : at + min(size, MAX_BLOCK_BYTES)], Limits()).coarseness
-    return 0.0
-
-
-def _strips(tags: Tags, file_bytes: int) -> tuple[tuple[int, ...], tuple[int, ...], bool]:
-    """Places and lengths of the strips, else the tiles, of a picture; whether all lie in the file."""
-    starts, lengths = (tags.integers(strip if strip in tags else tile) for strip, tile in _STRIPS)
-    return starts, lengths, all(a + n <= file_bytes for a, n in zip(starts, lengths, strict=False))
-
-
-def _check_strips(tags: Tags, file_bytes: int) -> None:
-    """Refuse a picture whose strips or tiles do not lie in the file."""
-    starts, lengths, inside = _strips(tags, file_bytes)
-    if not starts or len(starts) != len(lengths) or not inside:
-        raise TruncatedImageError(
-            f"the TIFF's {len(starts)} strips with {len(lengths)} lengths go beyond the file's end, or are "
-            f"damaged; {COPY_AGAIN}"
-        )
-    stored = _pixels(tags) * tags.integer(277, 1) * tags.integer(258, 1) / 8
-    if tags.integer(259, 1) == 1 and sum(lengths) < 0.999 * stored:
-        raise TruncatedImageError(
-            f"the TIFF holds {sum(lengths)} bytes of pixels where {stored:.0f} are needed"
-        )
 
 
 def _check_numbers(tags: Tags) -> None:

@@ -44,6 +44,7 @@ from lensmodel.photo.colour import (
 )
 from lensmodel.photo.containers import (
     COPY_AGAIN,
+    LOSSY_DNG,
     Header,
     JpegSegments,
     check_size,
@@ -65,7 +66,7 @@ from lensmodel.photo.values import (
     Transfer,
     remarks_log,
 )
-from lensmodel.photo.writing import Opcode, demosaiced, packed_opcodes, read_opcodes
+from lensmodel.photo.writing import OPCODES_2, OPCODES_3, demosaiced, packed_opcodes, read_opcodes
 
 MIN_SIDE = 16  # smaller pictures are icons, not photos
 
@@ -245,6 +246,7 @@ fields, as the tests do again. The noise of the planes is not white: at low freq
 the power of the sensor's in red and blue and 1.9 times in green, at the highest about half."""
 
 _FULL: Final = 65535.0  # 16 bits
+_WHITE: Final = 50717  # tag of the white level of a DNG, of all channels or of each: DNG 1.6, chapter 4
 _ORIENTATIONS: Final = {3: 3, 5: 8, 6: 6}  # how LibRaw says that a picture is turned -> EXIF orientation
 
 _LEAST_SHARE: Final = 0.25  # of the strongest that a channel is balanced by: it costs two of 16 bits
@@ -300,22 +302,27 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
 
     No white balance, no colour matrix, no rotation: 1.0 is the level at which the sensor saturates.
     """
-    header, mosaic = said.header, Mosaic.of(raw)
-    # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing
-    kept, lost = [] if header.coarseness else read_opcodes(header.opcodes_2), list[Opcode]()
-    white, clip, defects = int(raw.white_level), (1.0, 1.0, 1.0), 0
-    sensor_noise, cfa, stated = None, None, header.white
+    tags, mosaic, white, clip = said.tags, Mosaic.of(raw), int(raw.white_level), (1.0, 1.0, 1.0)
+    # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing, and stretches them
+    lossy = said.header.compression == LOSSY_DNG
+    steps = [] if lossy else read_opcodes(tags.raw(OPCODES_2))
+    stated = () if lossy else tags.integers(_WHITE, 3)
+    sensor_noise, cfa, remarks = None, None, list[str]()
     if mosaic is not None:
         white, clip = mosaic.saturation()
         sensor_noise, cfa, stated = mosaic.noise(white), mosaic.bayer_pattern(), ()
-        kept, lost = demosaiced(kept, cfa)
-        defects = mosaic.repair()
+        steps, lost = demosaiced(steps, cfa)
+        remarks += [f"its {step.name} is for the mosaic only and is dropped" for step in lost]
+        if count := mosaic.repair():
+            many = " of its sensor is" if count == 1 else "s of its sensor are"
+            remarks.append(f"{count} defective pixel{many} replaced")
     balance, own_balance = _white_balance(raw)
+    if not own_balance:
+        remarks.append("it does not say its white balance: its picture is made grey on average")
     planes = _developed(raw, white, balance, stated)
     _, height, width = planes.shape
     noise = _plane_noise(planes, sensor_noise, balance)
     to_srgb, xyz_to_camera = _colour(raw, balance)
-    many = " of its sensor is" if defects == 1 else "s of its sensor are"
     return LinearPhoto(
         planes=planes,
         frame=Frame(height, width),
@@ -329,22 +336,14 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
             to_srgb=matrix3(to_srgb),
             xyz_to_camera=matrix3(xyz_to_camera),
             baseline_exposure=said.baseline_exposure(),
-            opcodes_2=packed_opcodes(kept),
-            opcodes_3=packed_opcodes(read_opcodes(header.opcodes_3)),
+            opcodes_2=packed_opcodes(steps),
+            opcodes_3=packed_opcodes(read_opcodes(tags.raw(OPCODES_3))),
         ),
         sensor_noise=sensor_noise,
-        coding_noise=coding_noise(header.coarseness, curves_of("srgb")[1]),
+        coding_noise=coding_noise(said.header.coarseness, curves_of("srgb")[1]),
         cfa=cfa,
         grain=(1.0, 1.0, 1.0) if sensor_noise is not None else grain_of(planes, noise, clip),
-        remarks=(
-            *(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
-            *((f"{defects} defective pixel{many} replaced",) if defects else ()),
-            *(
-                ()
-                if own_balance
-                else ("it does not say its white balance: its picture is made grey on average",)
-            ),
-        ),
+        remarks=tuple(remarks),
     )
 
 
@@ -513,7 +512,7 @@ def _transfer_of(said: Said, pixels: Pixels) -> tuple[Transfer, bytes | None, tu
     instead = "its other tags say" if declared else "linear light" if floating else "sRGB"
     without = f"its ICC profile is damaged or not for RGB: its colours are read as {instead}"
     transfer: Transfer = "linear" if floating else "icc" if declared else "srgb"
-    return transfer, declared, (without,) if said.header.icc_lost or icc is not None else ()
+    return transfer, declared, (without,) if icc is not None else ()
 
 
 def _read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:

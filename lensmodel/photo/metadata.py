@@ -175,10 +175,8 @@ class Said:
 
     def _taken_at(self) -> datetime | None:
         for tag in (0x9003, 0x9004, 0x0132):
-            try:
+            with contextlib.suppress(ValueError):
                 return datetime.strptime((self.tags.text(tag) or "")[:19], "%Y:%m:%d %H:%M:%S")  # noqa: DTZ007  the camera's clock has no zone
-            except ValueError:
-                continue
         return None
 
     def _lens(self) -> LensIdentity:
@@ -484,14 +482,15 @@ def find_location(buffer: Buffer) -> tuple[list[Overwrite], bool]:
     if buffer[:4] == b"\x89PNG":
         with contextlib.suppress(TruncatedImageError):
             chunks.extend(png_chunks(buffer))
-    for place in (0, *(start for name, start, _ in chunks if name == b"eXIf")):
-        if reader := TiffReader.open(buffer, place):
-            spans += _of_tiff(buffer, reader)
     blocks = list(islice(_BLOCKS.finditer(buffer), MAX_BLOCKS + 1))
-    for block in blocks[:MAX_BLOCKS]:
-        if reader := TiffReader.open(buffer, block.end()):
-            of_gps = block[0] == b"CMT4"
-            spans += _directory(buffer, reader, reader.first) if of_gps else _of_tiff(buffer, reader)
+    places = [(0, False), *((start, False) for name, start, _ in chunks if name == b"eXIf")]
+    places += [(block.end(), block[0] == b"CMT4") for block in blocks[:MAX_BLOCKS]]
+    for place, is_of_gps in places:
+        if reader := TiffReader.open(buffer, place):
+            # the chain of a structure, and what hangs on it
+            pointers = (tags.integer(GPS) for _, tags in reader.walk(SUB_DIRECTORIES, EXIF))
+            for offset in [reader.first] if is_of_gps else pointers:
+                spans += _directory(buffer, reader, offset)
     words = list(islice(_XMP_GPS.finditer(buffer), MAX_WORDS + 1))
     for match in words[:MAX_WORDS]:
         start, end = match.span(match.lastindex or 0)
@@ -514,12 +513,6 @@ def gps_directory(path: Path) -> dict[int, Value]:
             if values:
                 return values
     return {}
-
-
-def _of_tiff(buffer: Buffer, reader: TiffReader) -> Iterator[Overwrite]:
-    """Yield the GPS directories of a TIFF structure: of its chain, and of what hangs on that."""
-    for _, tags in reader.walk(SUB_DIRECTORIES, EXIF):
-        yield from _directory(buffer, reader, tags.integer(GPS))
 
 
 def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[Overwrite]:

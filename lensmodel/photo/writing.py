@@ -57,7 +57,7 @@ _PNG_OPTIONS: Final = {"level": 2, "strategy": 3, "filter": 128}
 """Paeth filter and run lengths: on photos as small as the default search, three times faster."""
 
 # XMP specification, part 3; ICC.1:2022, annex B.4; DNG 1.6, chapter 6.
-_XMP_TAG, _ICC_TAG, _OPCODES_2, _OPCODES_3 = 700, 34675, 51009, 51022
+_XMP_TAG, _ICC_TAG, OPCODES_2, OPCODES_3 = 700, 34675, 51009, 51022
 
 _NOWHERE: Final[Written] = MappingProxyType({})
 
@@ -217,7 +217,7 @@ def _linear_dng_tags(encoding: Encoding) -> Written:
         # To XYZ under D50, and back from D65, which is what the DNG tag means.
         to_camera = np.linalg.inv(np.linalg.inv(D65_TO_D50) @ _to_xyz_d50(encoding))
     neutral = tuple(1.0 / balance for balance in encoding.white_balance)
-    lists = {_OPCODES_2: encoding.opcodes_2, _OPCODES_3: encoding.opcodes_3}
+    lists = {OPCODES_2: encoding.opcodes_2, OPCODES_3: encoding.opcodes_3}
     return {
         **dng_tags(encoding.metadata.without_serials(), to_camera, neutral, encoding.baseline_exposure),
         262: shorts(34892),  # PhotometricInterpretation: linear RAW

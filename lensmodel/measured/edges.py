@@ -23,11 +23,11 @@ Source of the edge spread: ISO 12233:2017, annex D, in `quality`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ from lensmodel.core.files import atomic
 from lensmodel.core.numerics import on_simplex
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Channel, Kernel, StepHook
-from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared, Window, psf_at
+from lensmodel.measured.measurer import Found, Measurer, Prepared, Window
 from lensmodel.measured.target import on_paper
 from lensmodel.photo import LinearPhoto
 from lensmodel.quality import (
@@ -53,9 +53,6 @@ from lensmodel.quality import (
     slanted_edge,
 )
 
-# Relative L2 that no square shows of itself: kernels are no mixtures of three Gaussians (chosen: half of the
-# squares of five traced lenses are off by .07 to .24)
-FLOOR: Final = 0.15
 _FREQUENCIES: Final = np.linspace(0.0, 0.5, 26)  # cycles/pixel: finer than a kernel resolves (chosen)
 _SLICE_ERROR: Final = 0.02  # of a transfer function: of an edge of 64 lines at 1 percent noise
 _CROSSING: Final = math.radians(45.0)  # edges closer in direction say nearly the same of a kernel (chosen)
@@ -79,9 +76,9 @@ class SlantedEdges(Measurer):
     """PSFs from the squares of a chart, wherever they are in the frame."""
 
     name: ClassVar[str] = "edges"
-    version: ClassVar[int] = 1
-    photos: ClassVar[int] = 1
-
+    # kernels are no mixtures of three Gaussians (chosen: half of the squares of five traced lenses are off by
+    # .07 to .24)
+    floor: ClassVar[float] = 0.15
     nothing: ClassVar[str] = (
         "no square could be measured, which takes two of its edges and the corner between them; photograph "
         "dark squares or a checkerboard, in focus and unclipped"
@@ -139,8 +136,7 @@ def _unit(normal: float) -> NDArray[np.float64]:
 # --- what is fitted to --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Line:
+class _Line(NamedTuple):
     """An edge as measured in one colour: unit normal n (row, col) and p, so that n.x = p on it."""
 
     normal: NDArray[np.float64]
@@ -148,58 +144,52 @@ class _Line:
     transfer: NDArray[np.complex128]  # along the normal, at `_FREQUENCIES`
     variance: float  # pixels^2, of the Gaussian whose contrast falls to a half where this does
 
-    @classmethod
-    def of(cls, photo: LinearPhoto, channel: Channel, edge: FoundEdge) -> _Line:
-        """Measure an edge; raises where that fails."""
-        row, col, side, _ = edge.box
-        window = Window.of(photo, channel, (row, col), side)
-        response = slanted_edge(window.light, window.measured)
-        transfer, middle = _transfer(response)
-        normal = _unit(response.normal)
-        half = crossing(_FREQUENCIES, np.abs(transfer), 0.5)
-        place = float(normal @ edge.middle) + response.offset + middle
-        return cls(normal, place, transfer, math.log(2.0) / (2.0 * math.pi**2 * half**2))
+
+def _line(photo: LinearPhoto, channel: Channel, edge: FoundEdge) -> _Line:
+    """Measure an edge; raises where that fails."""
+    row, col, side, _ = edge.box
+    window = Window.of(photo, channel, (row, col), side)
+    response = slanted_edge(window.light, window.measured)
+    transfer, middle = _transfer(response)
+    normal = _unit(response.normal)
+    half = crossing(_FREQUENCIES, np.abs(transfer), 0.5)
+    place = float(normal @ edge.middle) + response.offset + middle
+    return _Line(normal, place, transfer, math.log(2.0) / (2.0 * math.pi**2 * half**2))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Corner:
-    """Pixels around a corner that the sensor measured, over their noise, and what they show without blur."""
+_Misfit: TypeAlias = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-    seen: NDArray[np.bool_]  # (n, n), of a drawing wide enough for the blur of its rim
-    values: NDArray[np.float64]  # those that are seen
-    slope: NDArray[np.float64]  # (values, 3), terms of light that changes evenly
-    spectra: NDArray[np.complex128]  # (7, n, n // 2 + 1), both half planes, their product, and its changes
 
-    @classmethod
-    def of(
-        cls, photo: LinearPhoto, channel: Channel, edges: tuple[_Line, _Line], half: int
-    ) -> _Corner | None:
-        """Take the pixels around where two edges cross; None where they leave the frame."""
-        corner = np.linalg.solve([edge.normal for edge in edges], [edge.place for edge in edges])
-        row, col = np.rint(corner).astype(int) - half
-        side = 2 * half + 1
-        if min(row, col) < 0 or row + side > photo.frame.height or col + side > photo.frame.width:
-            return None
-        window = Window.of(photo, channel, (int(row), int(col)), side)
-        if (good := window.measured).sum() < side:
-            return None
-        noise = math.sqrt(float(window.variance[0, 0]))
-        slope = np.column_stack([np.ones(int(good.sum())), np.argwhere(good) / half - 1.0])
-        count = int(fft.next_fast_len(side + 2 * _SPARE_PX, real=True))
-        seen = np.zeros((count, count), dtype=np.bool_)
-        seen[_SPARE_PX : _SPARE_PX + side, _SPARE_PX : _SPARE_PX + side] = good
-        first = corner - (row - _SPARE_PX, col - _SPARE_PX)
-        return cls(seen, window.light[good] / noise, slope, _drawn(first, [e.normal for e in edges], count))
+def _corner(photo: LinearPhoto, channel: Channel, edges: tuple[_Line, _Line], half: int) -> _Misfit | None:
+    """How far the pixels around the crossing of two edges differ from a mixture's, over the noise.
 
-    def misfit(self, mixture: _Mixture) -> NDArray[np.float64]:
-        """What the best levels, shifts of the edges and slope of the light leave, over the noise."""
-        count = len(self.seen)
-        blurred = self.spectra * mixture.transfer(fft.fftfreq(count)[:, None], fft.rfftfreq(count)[None, :])
-        light = fft.irfft2(blurred, (count, count))[:, self.seen]
-        columns = np.column_stack([self.slope, light.T])
+    None where they leave the frame. The pixels are drawn with a rim wide enough for its blur.
+    """
+    corner = np.linalg.solve([edge.normal for edge in edges], [edge.place for edge in edges])
+    row, col = np.rint(corner).astype(int) - half
+    side = 2 * half + 1
+    if min(row, col) < 0 or row + side > photo.frame.height or col + side > photo.frame.width:
+        return None
+    window = Window.of(photo, channel, (int(row), int(col)), side)
+    if (good := window.measured).sum() < side:
+        return None
+    values = window.light[good] / math.sqrt(float(window.variance[0, 0]))
+    slope = np.column_stack([np.ones(values.size), np.argwhere(good) / half - 1.0])  # of the light
+    count = int(fft.next_fast_len(side + 2 * _SPARE_PX, real=True))
+    seen = np.zeros((count, count), dtype=np.bool_)
+    seen[_SPARE_PX : _SPARE_PX + side, _SPARE_PX : _SPARE_PX + side] = good
+    sharp = _drawn(corner - (row - _SPARE_PX, col - _SPARE_PX), [edge.normal for edge in edges], count)
+    frequencies = fft.fftfreq(count)[:, None], fft.rfftfreq(count)[None, :]
+
+    def misfit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the best levels, shifts of the edges and slope of the light leave."""
+        light = fft.irfft2(sharp * _mixture(vector, *frequencies), (count, count))[:, seen]
+        columns = np.column_stack([slope, light.T])
         gram = columns.T @ columns
-        terms = np.linalg.solve(gram + 1e-9 * np.trace(gram) * np.eye(len(gram)), columns.T @ self.values)
-        return np.asarray(self.values - columns @ terms)
+        terms = np.linalg.solve(gram + 1e-9 * np.trace(gram) * np.eye(len(gram)), columns.T @ values)
+        return np.asarray(values - columns @ terms)
+
+    return misfit
 
 
 def _drawn(
@@ -241,77 +231,51 @@ def _transfer(response: EdgeResponse) -> tuple[NDArray[np.complex128], float]:
 # --- the kernel ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Mixture:
-    """Three Gaussians: weights that sum to 1, means and covariances in pixels, (row, col)."""
+def _mixture(
+    vector: NDArray[np.float64], rows: NDArray[np.float64], cols: NDArray[np.float64]
+) -> NDArray[np.complex128]:
+    """Transfer function of three Gaussians at frequencies in cycles/pixel.
 
-    weights: NDArray[np.float64]  # (3,)
-    means: NDArray[np.float64]  # (3, 2)
-    covariances: NDArray[np.float64]  # (3, 2, 2)
-
-    @classmethod
-    def of(cls, vector: NDArray[np.float64]) -> _Mixture:
-        """Read the parameters: two Cholesky factors, two means, logarithms of weights and of a width."""
-        factors = np.zeros((3, 2, 2))
-        for factor, (down, both, across) in zip(factors, vector[:6].reshape(2, 3), strict=False):
-            factor[:] = (math.exp(down), 0.0), (both, math.exp(across))
-        factors[2] = math.exp(vector[12]) * np.eye(2)
-        weights = np.exp([0.0, *vector[10:12]])
-        means = np.concatenate([vector[6:10].reshape(2, 2), np.zeros((1, 2))])
-        return cls(weights / weights.sum(), means, factors @ factors.transpose(0, 2, 1))
-
-    @staticmethod
-    def start(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Parameters that a square of a covariance begins with."""
-        factor = np.linalg.cholesky(covariance)
-        down, both, across = factor[0, 0], factor[1, 0], factor[1, 1]
-        shapes = [[math.log(s * down), s * both, math.log(s * across)] for s in (_CORE, _WIDE)]
-        return np.array([*shapes[0], *shapes[1], *[0.0] * 4, *np.log(_START_WEIGHTS), math.log(_HALO_PX)])
-
-    def transfer(self, rows: NDArray[np.float64], cols: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Transfer function at frequencies in cycles/pixel."""
-        total: NDArray[np.complex128] = np.zeros(np.broadcast(rows, cols).shape, dtype=np.complex128)
-        for weight, (down, across), ((rr, rc), (_, cc)) in zip(
-            self.weights, self.means, self.covariances, strict=True
-        ):
-            spread = rr * rows**2 + 2.0 * rc * rows * cols + cc * cols**2
-            turn = 2j * np.pi * (rows * down + cols * across)
-            total = total + weight * np.exp(-2.0 * np.pi**2 * spread - turn)
-        return total
-
-    def kernel(self, size: int) -> Kernel:
-        """Kernel of pixels, by its transfer function up to the highest frequency that they hold."""
-        count = 3 * size
-        light = fft.irfft2(
-            self.transfer(fft.fftfreq(count)[:, None], fft.rfftfreq(count)[None, :]), (count,) * 2
-        )
-        middle = np.roll(light, (size // 2, size // 2), (0, 1))[:size, :size]
-        return as_kernel(on_simplex(middle.ravel(), 1.0).reshape(size, size))
+    Their parameters are two Cholesky factors, two means (row, col), logarithms of two weights over the
+    third, and of the width of the last, which is round.
+    """
+    shapes = [*vector[:6].reshape(2, 3), (vector[12], 0.0, vector[12])]
+    means = [*vector[6:10].reshape(2, 2), (0.0, 0.0)]
+    weights = np.exp([0.0, *vector[10:12]])
+    total: NDArray[np.complex128] = np.zeros(np.broadcast(rows, cols).shape, dtype=np.complex128)
+    for weight, (down, across), (a, b, c) in zip(weights / weights.sum(), means, shapes, strict=True):
+        rr, rc, cc = math.exp(a) ** 2, math.exp(a) * b, b * b + math.exp(c) ** 2  # covariance LL'
+        spread = rr * rows**2 + 2.0 * rc * rows * cols + cc * cols**2
+        turn = 2j * np.pi * (rows * down + cols * across)
+        total = total + weight * np.exp(-2.0 * np.pi**2 * spread - turn)
+    return total
 
 
-def _square_psf(photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge], size: int) -> MeasuredPsf:
+def _kernel(vector: NDArray[np.float64], size: int) -> Kernel:
+    """Kernel of pixels of a mixture, by its transfer function up to the highest frequency that they hold."""
+    count = 3 * size
+    light = fft.irfft2(
+        _mixture(vector, fft.fftfreq(count)[:, None], fft.rfftfreq(count)[None, :]), (count,) * 2
+    )
+    middle = np.roll(light, (size // 2, size // 2), (0, 1))[:size, :size]
+    return as_kernel(on_simplex(middle.ravel(), 1.0).reshape(size, size))
+
+
+def _square_psf(photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge], size: int) -> Found:
     """Fit the kernel of one square in one colour."""
-    lines = [_Line.of(photo, channel, edge) for edge in square]
+    lines = [_line(photo, channel, edge) for edge in square]
     half = math.ceil(_HALF_WIDTHS * math.sqrt(max(line.variance for line in lines)))
     half = min(max(half, _LEAST_HALF), _MOST_HALF)
     pairs = [(a, b) for a, b in combinations(lines, 2) if abs(a.normal @ b.normal) < math.cos(_CROSSING)]
-    around = [_Corner.of(photo, channel, pair, half) for pair in pairs]
+    around = [_corner(photo, channel, pair, half) for pair in pairs]
     corners = [corner for corner in around if corner is not None]
     if not corners:
         raise NotEnoughEvidenceError("no corner of the square is seen")
-    middle = np.mean([edge.middle for edge in square], axis=0)
-    side = max(max(edge.box[2:]) for edge in square)
-    return psf_at(photo, channel, _fitted(lines, corners).kernel(size), middle, side, FLOOR)
-
-
-def _fitted(lines: Sequence[_Line], corners: Sequence[_Corner]) -> _Mixture:
-    """Fit a mixture to edges and corners."""
 
     def misfit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        mixture = _Mixture.of(vector)
-        waves = [mixture.transfer(*(_FREQUENCIES * n for n in line.normal)) - line.transfer for line in lines]
+        waves = [_mixture(vector, *(_FREQUENCIES * n for n in line.normal)) - line.transfer for line in lines]
         slices = [part / _SLICE_ERROR for wave in waves for part in (wave.real, wave.imag)]
-        return np.concatenate([*slices, *(corner.misfit(mixture) for corner in corners)])
+        return np.concatenate([*slices, *(corner(vector) for corner in corners)])
 
     start = min(_starts(lines), key=lambda vector: float(np.square(misfit(vector)).sum()))
     low = np.full(start.size, -np.inf)
@@ -321,7 +285,11 @@ def _fitted(lines: Sequence[_Line], corners: Sequence[_Corner]) -> _Mixture:
         lambda vector: np.concatenate([misfit(vector), (vector - start) / _SPREAD]),
         start, bounds=(low, np.inf), x_scale=_SPREAD, max_nfev=_STEPS, ftol=1e-7,
     )  # fmt: skip
-    return _Mixture.of(result.x)
+    middle, side = (
+        np.mean([edge.middle for edge in square], axis=0),
+        max(max(edge.box[2:]) for edge in square),
+    )
+    return Found(_kernel(result.x, size), 0.0, middle, side)
 
 
 def _starts(lines: Sequence[_Line]) -> list[NDArray[np.float64]]:
@@ -334,7 +302,13 @@ def _starts(lines: Sequence[_Line]) -> list[NDArray[np.float64]]:
     )
     both = math.sqrt(first * second) * (np.outer(n, m) + np.outer(m, n))
     ellipse = first * np.outer(n, n) + second * np.outer(m, m)
-    return [_Mixture.start(ellipse + share * both) for share in np.linspace(-0.9, 0.9, 7)]
+    starts = []
+    for share in np.linspace(-0.9, 0.9, 7):
+        (down, _), (lower, across) = np.linalg.cholesky(ellipse + share * both)
+        shapes = [(math.log(s * down), s * lower, math.log(s * across)) for s in (_CORE, _WIDE)]
+        rest = [0.0] * 4, np.log(_START_WEIGHTS), [math.log(_HALO_PX)]
+        starts.append(np.concatenate([*shapes, *rest]))
+    return starts
 
 
 # --- the chart -----------------------------------------------------------------------------------

@@ -39,8 +39,8 @@ import contextlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Final, TypeAlias
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy
@@ -78,16 +78,29 @@ class MeasuredPsf:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))
 
 
-Prepared: TypeAlias = tuple[Sequence[Any], Callable[[Any, Channel], MeasuredPsf]]
+class Found(NamedTuple):
+    """A kernel, and the window of the photo that tells of it."""
+
+    kernel: Kernel
+    error: float  # expected relative L2, as far as the window shows it
+    middle: Sequence[float] | NDArray[np.floating]  # pixel (row, col)
+    side: int  # in pixels
+
+
+Prepared: TypeAlias = tuple[Sequence[Any], Callable[[Any, Channel], Found]]
 
 
 class Measurer(ABC):
     """One way to measure the PSF of a lens on photos made for it."""
 
     name: ClassVar[str]
-    version: ClassVar[int]
-    photos: ClassVar[int]
+    version: ClassVar[int] = 1
+    photos: ClassVar[int] = 1
     """How many photos one measurement takes."""
+    floor: ClassVar[float]
+    """Error that no window shows of itself."""
+    most: ClassVar[float] = math.inf
+    """Expected error from which on a kernel helps no model: blind ones are as good."""
     nothing: ClassVar[str]
     """What is missing where no place gives a PSF."""
 
@@ -116,7 +129,11 @@ class Measurer(ABC):
         for done, place in enumerate(places, start=1):
             for channel in channels:
                 with contextlib.suppress(LensModelError):
-                    psfs.append(psf_in(place, channel))
+                    kernel, own, (row, col), side = psf_in(place, channel)
+                    error, position = math.hypot(own, self.floor), photos[0].frame.position(row, col)
+                    if error < self.most:  # an error that is not known is none
+                        pixel = float(row), float(col)
+                        psfs.append(MeasuredPsf(kernel, position, channel, error, pixel, side))
             on_step(done, len(places))
         if not psfs:
             raise NotEnoughEvidenceError(self.nothing)
@@ -155,22 +172,6 @@ def samples_of(
     ]
 
 
-def psf_at(
-    photo: LinearPhoto,
-    channel: Channel,
-    kernel: Kernel,
-    pixel: NDArray[np.floating],
-    side: int,
-    error: float,
-    most: float = math.inf,
-) -> MeasuredPsf:
-    """Say where a kernel was measured; refuse one whose expected error is as large as that of a blind one."""
-    if not error < most:  # nor one that is not known
-        raise NotEnoughEvidenceError(f"the kernel is expected to be wrong by {error:.0%}")
-    row, col = map(float, pixel)
-    return MeasuredPsf(kernel, photo.frame.position(row, col), channel, error, (row, col), side)
-
-
 # --- the kernel of a window ------------------------------------------------------------------------
 
 
@@ -188,10 +189,19 @@ def window_terms(side: int, margin: int) -> NDArray[np.float64]:
 
 PEAK: Final = 0.5  # T: so much light has the middle of the sharpest kernel, a pixel and some diffraction
 REACH: Final = 2.5  # D in pixels: light 10 px away is expected below 3 percent, ten times that of wide halos
+# Width of the prior of k_u and k_v over that of k (chosen: at three times as much nothing changed; measured
+# once, no command repeats it)
+CHANGE: Final = 0.3
+CENTRED_PX: Final = 0.3  # expected distance of the centre of mass from the middle: that of the match (chosen)
 _ROWS: Final = 2048  # of the design matrix at once: a whole window would take hundreds of megabytes (chosen)
 _STEPS: Final = 300  # of the projected gradient: more only cost time (chosen)
 _STILL: Final = 1e-7  # of the light: no value moves by more
+_MOST_PX: Final = 1.0  # largest phase along an axis: a whole pixel is another match (chosen)
+_FIRST_PX, _LAST_PX = 0.25, 0.03  # steps of the search for the phase, coarse to fine (chosen)
+_SEARCHED: Final = 100  # steps from one phase to the next: only the order of their misfits counts (chosen)
 _NO_KERNEL: Final = "no kernel explains this window; the latent picture does not match it"
+
+_Floats: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,80 +232,52 @@ def solve(
     autocovariance of noise that it has itself, which would pass for picture and make the kernel too wide.
     Only without it may the kernel be `varying`; that needs no centring.
     """
-    if int(measured.sum()) < size * size:
-        raise NotEnoughEvidenceError(
-            f"{int(measured.sum())} pixels count, {size * size} are needed for a kernel of side {size}"
-        )
+    n, count = size * size, int(measured.sum())
+    if count < n:
+        raise NotEnoughEvidenceError(f"{count} pixels count, {n} are needed for a kernel of side {size}")
     weight = np.where(measured, 1.0 / np.maximum(variance, 1e-12), 0.0)
-    whole = _normal_equations(observed, latent, weight, size, even=even, varying=varying)
+    whole = _gram(observed, latent, weight, size, even=even, varying=varying)
     if latent_noise is not None:
         # that of all values of a window of `size` pixels, shape (size², size²)
-        row, col = (i[:, None] - i + size - 1 for i in np.divmod(np.arange(size * size), size))
-        whole = replace(whole, a=whole.a - latent_noise[row, col] * weight.sum())
-    prior = 1.0 / prior_width(size) ** 2
-    count, misfit, moved = int(measured.sum()), 1.0, (0.0, 0.0)
-    k = np.zeros(size * size)
-    eq = whole.over(misfit, prior)
+        row, col = (i[:, None] - i + size - 1 for i in np.divmod(np.arange(n), size))
+        whole[:n, :n] -= latent_noise[row, col] * weight.sum()
+    t = np.arange(size) - size // 2
+    prior = ((1.0 + (t[:, None] ** 2 + t**2) / REACH**2) / PEAK).ravel() ** 2  # 1 / t(d)²
+    k, misfit, moved = np.zeros(n), 1.0, np.zeros(2)
+    gram = _of_kernel(whole, misfit, prior)
     for _ in range(2):  # the second time with the residuals of the first
-        if latent_noise is None:
-            k = _bounded(eq.a + np.diag(prior), eq.b, k)
-        else:  # less its noise a latent picture leaves directions open, and the free minimum's sum with them
-            k = nonnegative_least_squares(eq.a + np.diag(prior), eq.b, k, _STEPS)
-        rest = eq.power - 2.0 * float(eq.b @ k) + float(k @ eq.a @ k)
-        misfit = max(misfit * rest / count, 1.0)
-        eq = whole.over(misfit, prior)
+        a, b = gram[:n, :n] + np.diag(prior), gram[:n, n]
+        # less its noise a latent picture leaves directions open, and the free minimum's sum with them
+        k = _bounded(a, b, k) if latent_noise is None else nonnegative_least_squares(a, b, k, _STEPS)
+        rest = np.append(-k, 1.0)
+        misfit = max(misfit * float(rest @ gram @ rest) / count, 1.0)
+        gram = _of_kernel(whole, misfit, prior)
     if varying:
-        k, moved = _on_its_grid(eq, prior, k, size)
+        k, moved = _on_its_grid(gram, prior, k, size)
     light = float(k.sum())
     if not light > 0.0:
         raise NotEnoughEvidenceError(_NO_KERNEL)
     kernel = as_kernel(k.reshape(size, size))
-    off = centroid(kernel)
-    return Solved(
-        kernel=kernel,
-        light=light,
-        shift=(off[0] + moved[0], off[1] + moved[1]),
-        error=_error_of(eq.a + np.diag(prior), k),
-    )
+    row, col = np.add(centroid(kernel), moved)
+    # root of the posterior variance of all values over the norm of the kernel; 1 is the worst
+    posterior = scipy.linalg.inv(gram[:n, :n] + np.diag(prior), check_finite=False)
+    spread = float(np.maximum(np.diag(posterior), 0.0).sum())
+    return Solved(kernel, light, (float(row), float(col)), min(math.sqrt(spread / float(k @ k)), 1.0))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Equations:
-    """Normal equations of the kernel, or of k, k_u and k_v: k'Ak/2 - b'k, and y'Wy."""
-
-    a: NDArray[np.float64]
-    b: NDArray[np.float64]
-    power: float
-
-    def over(self, misfit: float, prior: NDArray[np.float64]) -> _Equations:
-        """Divide by the misfit, and eliminate k_u and k_v where they are there."""
-        scaled, n = _Equations(self.a / misfit, self.b / misfit, self.power / misfit), len(prior)
-        if len(self.b) == n:
-            return scaled
-        inner = scaled.a[n:, n:] + np.diag(np.tile(prior / CHANGE**2, 2))
-        return scaled.without(n, lambda right: scipy.linalg.solve(inner, right, assume_a="sym"))
-
-    def without(self, n: int, solved: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> _Equations:
-        """Eliminate all unknowns but the first n (Schur's complement); `solved` divides by their block."""
-        across, b = self.a[n:, :n], self.b[n:]
-        by = solved(np.concatenate([across, b[:, None]], axis=1))
-        return _Equations(
-            self.a[:n, :n] - across.T @ by[:, :n],
-            self.b[:n] - across.T @ by[:, n],
-            self.power - float(b @ by[:, n]),
-        )
-
-
-def _normal_equations(
+def _gram(
     observed: NDArray[np.floating],
     latent: NDArray[np.floating],
-    weight: NDArray[np.float64],
+    weight: _Floats,
     size: int,
     *,
     even: bool,
     varying: bool,
-) -> _Equations:
-    """Normal equations of k, or of k, k_u and k_v, with slow changes of light eliminated."""
+) -> _Floats:
+    """Weighted products of all columns: those of k, or of k, k_u and k_v, less slow changes of light, and y.
+
+    With v = (-k, 1) the sum of squared residuals is  v' G v,  so that G holds the normal equations.
+    """
     # a constant is one of the slow changes; without it single precision holds the detail
     latent = np.asarray(latent - latent.mean(), dtype=np.float32)
     observed = np.asarray(observed - observed[weight > 0].mean(), dtype=np.float32)
@@ -303,25 +285,33 @@ def _normal_equations(
     u, v = (np.linspace(-1.0, 1.0, n) for n in weight.shape)
     terms = quadratic(u[:, None], v[None, :]).astype(np.float32)
     rows, cols = np.nonzero(weight)
-    n = (3 if varying else 1) * size * size
+    kept = (3 if varying else 1) * size * size + 1
     of_light = 1 if even else terms.shape[-1]
-    gram = np.zeros((n + of_light + 1,) * 2)
+    gram = np.zeros((kept + of_light,) * 2)
     for first in range(0, rows.size, _ROWS):
         part = rows[first : first + _ROWS], cols[first : first + _ROWS]
         x, slow = views[part].reshape(part[0].size, -1), terms[part]
         moving = [x * slow[:, 1:2], x * slow[:, 2:3]] if varying else []
-        columns = np.concatenate([x, *moving, slow[:, :of_light], observed[part][:, None]], axis=1)
+        columns = np.concatenate([x, *moving, observed[part][:, None], slow[:, :of_light]], axis=1)
         columns *= np.sqrt(weight[part]).astype(np.float32)[:, None]
         gram += columns.T @ columns
-    light = np.linalg.pinv(gram[n:-1, n:-1], hermitian=True)  # few pixels may not tell all terms apart
-    return _Equations(gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1])).without(
-        n, lambda right: light @ right
-    )
+    light, across = gram[kept:, kept:], gram[kept:, :kept]
+    # few pixels may not tell all terms apart
+    return gram[:kept, :kept] - across.T @ (np.linalg.pinv(light, hermitian=True) @ across)
 
 
-def _bounded(
-    a: NDArray[np.float64], b: NDArray[np.float64], start: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _of_kernel(gram: _Floats, misfit: float, prior: _Floats) -> _Floats:
+    """Products over the misfit, of k and y alone: k_u and k_v, if they are there, eliminated (Schur)."""
+    n, gram = len(prior), gram / misfit
+    if len(gram) == n + 1:
+        return gram
+    kept = np.append(np.arange(n), len(gram) - 1)
+    inner = gram[n:-1, n:-1] + np.diag(np.tile(prior / CHANGE**2, 2))
+    across = gram[n:-1, kept]
+    return gram[np.ix_(kept, kept)] - across.T @ scipy.linalg.solve(inner, across, assume_a="sym")
+
+
+def _bounded(a: _Floats, b: _Floats, start: _Floats) -> _Floats:
     """Minimise k'Ak/2 - b'k over k >= 0 of the free minimum's sum."""
     eigenvalues = np.linalg.eigvalsh(a)
     largest = float(eigenvalues[-1])
@@ -333,14 +323,7 @@ def _bounded(
     return _of_sum(a, b, start, light, largest + lift, _STEPS)
 
 
-def _of_sum(
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    start: NDArray[np.float64],
-    light: float,
-    largest: float,
-    steps: int,
-) -> NDArray[np.float64]:
+def _of_sum(a: _Floats, b: _Floats, start: _Floats, light: float, largest: float, steps: int) -> _Floats:
     """Minimise k'Ak/2 - b'k over k >= 0 of a sum; `largest` bounds the eigenvalues of A."""
     return fista(
         lambda k: a @ k - b,
@@ -352,44 +335,23 @@ def _of_sum(
     )
 
 
-def prior_width(size: int) -> NDArray[np.float64]:
-    """Return t(d), shape (k²,)."""
-    t = np.arange(size) - size // 2
-    return (PEAK / (1.0 + (t[:, None] ** 2 + t[None, :] ** 2) / REACH**2)).ravel()
-
-
-def _error_of(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
-    """Root of the posterior variance of all values over the norm of the kernel; 1 is the worst."""
-    try:
-        inverse = scipy.linalg.inv(precision, check_finite=False)
-    except scipy.linalg.LinAlgError:
-        return 1.0
-    variance = float(np.maximum(np.diag(inverse), 0.0).sum())
-    return min(math.sqrt(variance / float(k @ k)), 1.0)
-
-
-# Width of the prior of k_u and k_v over that of k (chosen: at three times as much nothing changed; measured
-# once, no command repeats it)
-CHANGE: Final = 0.3
-CENTRED_PX: Final = 0.3  # expected distance of the centre of mass from the middle: that of the match (chosen)
-_MOST_PX: Final = 1.0  # largest phase along an axis: a whole pixel is another match (chosen)
-_FIRST_PX, _LAST_PX = 0.25, 0.03  # steps of the search for the phase, coarse to fine (chosen)
-_SEARCHED: Final = 100  # steps from one phase to the next: only the order of their misfits counts (chosen)
-
-
-def _on_its_grid(
-    eq: _Equations, prior: NDArray[np.float64], start: NDArray[np.float64], size: int
-) -> tuple[NDArray[np.float64], tuple[float, float]]:
+def _on_its_grid(gram: _Floats, prior: _Floats, start: _Floats, size: int) -> tuple[_Floats, _Floats]:
     """Kernel and phase (row, col) in pixels at which k >= 0 explains the window best."""
-    light, k = float(start.sum()), start
+    n, t, k, light = len(prior), np.arange(size), start, float(start.sum())
     # moving a kernel by sinc lengthens none; the prior is the same for all
-    largest = 1.02 * float(
-        scipy.linalg.eigvalsh(eq.a + np.diag(prior), subset_by_index=(len(prior) - 1,) * 2)[0]
-    )
+    last = {"subset_by_index": (n - 1, n - 1)}
+    largest = 1.02 * float(scipy.linalg.eigvalsh(gram[:n, :n] + np.diag(prior), **last)[0])
 
-    def cost(phase: NDArray[np.float64]) -> float:
+    def cost(phase: _Floats) -> float:
+        """Misfit of the best kernel at a phase, k'S'ASk - 2 b'Sk and the priors."""
         nonlocal k
-        a, b = _moved(eq, phase, size)
+        down, across = (np.sinc(t[:, None] - t - by) for by in phase)
+
+        def left(m: _Floats) -> _Floats:  # S'm, axis by axis
+            rows = (down.T @ m.reshape(size, -1)).reshape(size, size, -1)
+            return np.asarray(np.matmul(across.T, rows).reshape(n, -1))
+
+        a, b = left(left(gram[:n, :n]).T), left(gram[:n, n])[:, 0]
         k = _of_sum(a + np.diag(prior), b, k, light, largest, _SEARCHED)
         off = centroid(as_kernel(k.reshape(size, size)))
         misfit = float(k @ a @ k) - 2.0 * float(b @ k) + float(prior @ (k * k))
@@ -401,28 +363,13 @@ def _on_its_grid(
         options={**steps, "fatol": np.inf},
     )  # fmt: skip
     cost(best.x)
-    return k, (float(best.x[0]), float(best.x[1]))
-
-
-def _moved(
-    eq: _Equations, phase: NDArray[np.float64], size: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """S'AS and S'b, axis by axis."""
-    n, t = size * size, np.arange(size)
-    down, across = (np.sinc(t[:, None] - t - by) for by in phase)
-
-    def left(m: NDArray[np.float64]) -> NDArray[np.float64]:
-        rows = (down.T @ m.reshape(size, -1)).reshape(size, size, -1)
-        return np.asarray(np.matmul(across.T, rows).reshape(n, -1))
-
-    return left(left(eq.a).T), left(eq.b[:, None])[:, 0]
+    return k, best.x
 
 
 # `latent(shift, margin)`: the sharp picture of a window, moved down and right by `shift` pixels
 Latent = Callable[[tuple[float, float], int], NDArray[np.floating]]
 SMALL: Final = 15  # side of the kernel by which the middle is found: its wings hardly move it
 NEAR_CLIP: Final = 0.97  # of the clipping level, above which no pixel is believed: sensors bend before it
-_FEWEST: Final = 64  # pixels of a window to fit its light to: five to ten for each term (chosen)
 _MOST_SHIFT: Final = 3.0  # pixels; beyond, the small kernel is cut off
 
 
@@ -430,11 +377,10 @@ _MOST_SHIFT: Final = 3.0  # pixels; beyond, the small kernel is cut off
 class Window:
     """A square window of one colour of a photo."""
 
-    photo: LinearPhoto
-    channel: Channel
     corner: tuple[int, int]  # top left pixel, (row, col)
     light: NDArray[np.float64]  # (side, side)
     measured: NDArray[np.bool_]  # which pixels the sensor measured in this colour, unclipped
+    noise: NoiseModel  # of the pixels that were measured
 
     @classmethod
     def of(cls, photo: LinearPhoto, channel: Channel, corner: tuple[int, int], side: int) -> Window:
@@ -445,18 +391,12 @@ class Window:
         if photo.cfa is not None:
             rows, cols = (row + np.arange(side)) % 2, (col + np.arange(side)) % 2
             measured &= np.asarray(photo.cfa)[rows[:, None], cols[None, :]] == index
-        return cls(photo, channel, corner, light, measured)
-
-    def require_measured(self) -> NDArray[np.bool_]:
-        """Return which pixels were measured; raises where these are too few to fit its light to."""
-        if int(self.measured.sum()) < _FEWEST:
-            raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
-        return self.measured
+        return cls(corner, light, measured, (photo.sensor_noise or photo.noise)[index])
 
     @property
-    def noise(self) -> NoiseModel:
-        """Noise of the pixels that were measured."""
-        return (self.photo.sensor_noise or self.photo.noise)[CHANNELS.index(self.channel)]
+    def middle(self) -> NDArray[np.float64]:
+        """Pixel (row, col) of the photo."""
+        return np.add(self.corner, (len(self.light) - 1) / 2.0)
 
     @property
     def variance(self) -> NDArray[np.float64]:
@@ -467,17 +407,11 @@ class Window:
         own = self.noise.shot * np.maximum(self.light, 0.0) + self.noise.read
         return np.full(own.shape, float(own[self.measured].mean()) if self.measured.any() else 1.0)
 
-    def psf(self, kernel: Kernel, error: float, floor: float, most: float) -> MeasuredPsf:
-        """Say that a kernel was measured here, with an error of its own and one that no window shows."""
-        side = len(self.light)
-        middle, whole = np.add(self.corner, (side - 1) / 2.0), float(np.hypot(error, floor))
-        return psf_at(self.photo, self.channel, kernel, middle, side, whole, most)
-
 
 def window_psf(
     window: Window, latent: Latent, size: int, *, latent_noise: NDArray[np.floating] | None = None
-) -> tuple[Kernel, Solved, tuple[float, float]]:
-    """Measure the PSF of one window.
+) -> tuple[Kernel, float, tuple[float, float]]:
+    """Measure the PSF of one window: kernel, expected error, and how far the latent picture was moved.
 
     First a small kernel, whose centre of mass says how far the photo lies beyond the latent picture; that
     is moved, and solved again, so that the kernel comes out nearly centred and needs no interpolation, which
@@ -487,14 +421,14 @@ def window_psf(
     given = window.light, latent(shift, size // 2), window.measured, window.variance, size
     if latent_noise is None:
         solved = solve(*given, varying=True)
-        return solved.kernel, solved, shift
+        return solved.kernel, solved.error, shift
     # less its noise a latent picture says too little of how the kernel changes, and of the best grid
     solved = solve(*given, latent_noise)
-    return centred(solved.kernel), solved, shift
+    return centred(solved.kernel), solved.error, shift
 
 
-def roughly(window: Window, latent: Latent, size: int = SMALL) -> tuple[Solved, tuple[float, float]]:
-    """Find a small kernel of a window."""
+def roughly(window: Window, latent: Latent, size: int = SMALL) -> tuple[Kernel, tuple[float, float]]:
+    """Find a small kernel of a window, and how far the photo lies beyond the latent picture."""
     shift = (0.0, 0.0)
     for _ in range(2):
         first = solve(window.light, latent(shift, size // 2), window.measured, window.variance, size)
@@ -503,7 +437,7 @@ def roughly(window: Window, latent: Latent, size: int = SMALL) -> tuple[Solved, 
             raise NotEnoughEvidenceError("the window lies elsewhere than the rest of the reference says")
         if max(map(abs, first.shift)) < 0.02:
             break
-    return first, shift
+    return first.kernel, shift
 
 
 def window_corners(

@@ -29,7 +29,8 @@ from scipy import fft, ndimage
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, block_means
 from lensmodel.measured.measurer import (
-    MeasuredPsf,
+    Found,
+    Latent,
     Measurer,
     Prepared,
     Window,
@@ -40,20 +41,20 @@ from lensmodel.measured.registration import CLEAR, Warp, match, matched
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import PlaneNoise
 
-FLOOR: Final = 0.05  # error that no window shows of itself: of a lens at f/8 against diffraction (chosen)
 USUAL_F_NUMBER: Final = 8.0  # of the closed photo where it does not say: the sharpest of most lenses
-_USUAL_PITCH_UM: Final = 4.5  # where the photo does not say; as for `FLOOR`
+_USUAL_PITCH_UM: Final = 4.5  # where the photo does not say (chosen)
 _SIDE: Final = 160  # pixels of a window: the kernel changes in a larger one, a smaller tells less (chosen)
 _SPARE: Final = 24  # pixels around a window: deconvolution and interpolation spoil the rim
 _DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised more than eightfold
 _STOPS_APART: Final = 2.0  # least: blur that both photos share is missing in the kernel (chosen)
-_SURE: Final = 0.3  # expected relative L2 from which on a window is dropped: blind ones are as good (chosen)
 _COARSE: Final = 4  # photos are shrunk so far for the first match: a nudged tripod is within reach (chosen)
 _NOISE_GRID: Final = 128  # frequencies along an axis: its lags have to hold two kernels (chosen)
 _RINGS: Final = 16  # of 0 to 0.5 cycles/pixel: a window has few frequencies for each of more (chosen)
 # Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least
 # error for the lens of development (third order, 4). Measured once, no command repeats it
 _ALIASED: Final = 0.03
+# Frequencies (row, col) of a colour's grid in a mosaic, against which its aliases are mirrored
+_ALIASES: Final = {"g": ((0.5, 0.5),), **dict.fromkeys("rb", ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5)))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +66,9 @@ class AperturePair(Measurer):
     side: int = _SIDE  # side of a window in pixels
 
     name: ClassVar[str] = "pair"
-    version: ClassVar[int] = 1
     photos: ClassVar[int] = 2
-
+    floor: ClassVar[float] = 0.05  # of a lens at f/8 against diffraction (chosen)
+    most: ClassVar[float] = 0.3
     nothing: ClassVar[str] = (
         "no part of the pair determines a PSF; photograph a scene with fine detail everywhere, flat and in "
         "focus"
@@ -79,9 +80,14 @@ class AperturePair(Measurer):
         opened, closed = _with_bounded_noise(photos)
         warp = self.register(opened, closed, on_step)
         corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
-        return corners, lambda corner, channel: self._window(
-            closed, warp, Window.of(opened, channel, corner, self.side), size
-        )
+
+        def psf_in(corner: tuple[int, int], channel: Channel) -> Found:
+            window = Window.of(opened, channel, corner, self.side)
+            scene, noise = _scene(closed, warp, window, channel, size)
+            kernel, error, _ = window_psf(window, scene, size, latent_noise=noise)
+            return Found(kernel, error, window.middle, self.side)
+
+        return corners, psf_in
 
     def register(self, opened: LinearPhoto, closed: LinearPhoto, on_step: StepHook) -> Warp:
         """Lay the closed photo under the open one."""
@@ -110,20 +116,6 @@ class AperturePair(Measurer):
             warp = matched(warp, shown, plane, corners, self.side, degree, on_step)
         return warp
 
-    def _window(self, closed: LinearPhoto, warp: Warp, window: Window, size: int) -> MeasuredPsf:
-        """PSF of one window."""
-        around = size // 2
-        scene = _Scene(closed, warp, window, around)
-
-        def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
-            cut = around - margin
-            whole = scene.moved(shift)
-            return whole[cut : whole.shape[0] - cut, cut : whole.shape[1] - cut]
-
-        noise = scene.noise(size) - scene.alias(latent((0.0, 0.0), 0), size)
-        kernel, solved, _ = window_psf(window, latent, size, latent_noise=noise)
-        return window.psf(kernel, solved.error, FLOOR, _SURE)
-
 
 def _require_pair(opened: LinearPhoto, closed: LinearPhoto) -> None:
     if opened.frame != closed.frame:
@@ -139,70 +131,47 @@ def _require_pair(opened: LinearPhoto, closed: LinearPhoto) -> None:
         )
 
 
-class _Scene:
-    """The sharp picture around one window, on the pixels of the open photo.
+def _scene(
+    closed: LinearPhoto, warp: Warp, window: Window, channel: Channel, size: int
+) -> tuple[Latent, NDArray[np.float64]]:
+    """Sharp picture around a window, on the pixels of the open photo, and the autocovariance of its noise.
 
     The cosine transform filters as if the picture were mirrored at its rim, which suits a transfer
     function that is real and even.
     """
+    known, index = closed.info.metadata, CHANNELS.index(channel)
+    lens = known.aperture or USUAL_F_NUMBER, known.pixel_pitch_um or _USUAL_PITCH_UM
 
-    def __init__(self, closed: LinearPhoto, warp: Warp, window: Window, around: int) -> None:
-        self._warp, self._channel = warp, window.channel
-        pixels = np.arange(-around, len(window.light) + around)
-        self._rows, self._cols = (at + pixels for at in window.corner)
-        known = closed.info.metadata
-        self._f_number = known.aperture or USUAL_F_NUMBER
-        self._pitch_um = known.pixel_pitch_um or _USUAL_PITCH_UM
-        self._mosaic = closed.cfa is not None
-        index = CHANNELS.index(window.channel)
-        rows, cols = self._places((0.0, 0.0))
-        top, left = (max(int(at.min()) - _SPARE, 0) for at in (rows, cols))
-        bottom, right = int(rows.max()) + _SPARE + 1, int(cols.max()) + _SPARE + 1
-        region = np.asarray(closed.planes[index, top:bottom, left:right], dtype=np.float64)
-        self._corner = top, left
-        height, width = region.shape
-        filtered = fft.dctn(region, norm="ortho") * self._inverse(
-            np.arange(height)[:, None] / (2.0 * height), np.arange(width)[None, :] / (2.0 * width)
-        )
-        sharp = fft.idctn(filtered, norm="ortho")
-        self._spline = ndimage.spline_filter(sharp, order=5, mode="mirror")
-        self._variance = float(closed.noise[index].variance(np.array([region.mean()]))[0])
-
-    def moved(self, shift: tuple[float, float]) -> NDArray[np.float64]:
-        """Return the picture moved down and right by `shift` pixels."""
-        rows, cols = self._places(shift)
-        places = np.stack([rows - self._corner[0], cols - self._corner[1]])
-        picture = ndimage.map_coordinates(self._spline, places, order=5, prefilter=False, mode="mirror")
-        return np.asarray(picture, dtype=np.float64)
-
-    def noise(self, size: int) -> NDArray[np.float64]:
-        """Autocovariance of what noise the deconvolution leaves in it, shape (2 size - 1, 2 size - 1)."""
-        f = fft.fftfreq(_NOISE_GRID)
-        return _covariance(np.square(self._inverse(f[:, None], f[None, :])) * self._variance, size)
-
-    def alias(self, window: NDArray[np.floating], size: int) -> NDArray[np.float64]:
-        """Autocovariance of what demosaicing made up in a window of it, shape (2 size - 1, 2 size - 1)."""
-        if not self._mosaic:
-            return np.zeros((2 * size - 1, 2 * size - 1))
-        f = np.abs(fft.fftfreq(_NOISE_GRID))
-        power_at = _power_by_frequency(window)
-        shifts = ((0.5, 0.5),) if self._channel == "g" else ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5))
-        others = [np.hypot((down - f)[:, None], (right - f)[None, :]) for down, right in shifts]
-        return _covariance(_ALIASED * np.sum([power_at(other) for other in others], axis=0), size)
-
-    def _places(self, shift: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return self._warp(*np.meshgrid(self._rows - shift[0], self._cols - shift[1], indexing="ij"))
-
-    def _inverse(self, rows: NDArray[np.float64], cols: NDArray[np.float64]) -> NDArray[np.float64]:
+    def inverse(rows: NDArray[np.float64], cols: NDArray[np.float64]) -> NDArray[np.float64]:
         """Wiener's inverse of the closed lens's blur."""
-        h = diffraction_otf(rows, cols, self._f_number, self._pitch_um, self._channel)
+        h = diffraction_otf(rows, cols, *lens, channel)
         return np.asarray((1.0 + _DAMPING) * h / (h * h + _DAMPING))
 
+    def places(shift: tuple[float, float], margin: int) -> NDArray[np.float64]:
+        t = np.arange(-margin, len(window.light) + margin)
+        rows, cols = (at + t - by for at, by in zip(window.corner, shift, strict=True))
+        return np.stack(warp(*np.meshgrid(rows, cols, indexing="ij")))
 
-def _covariance(power: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Autocovariance by lag of what has a power spectrum, shape (2 size - 1, 2 size - 1)."""
+    around = places((0.0, 0.0), size // 2)
+    first = np.maximum(around.min(axis=(1, 2)).astype(int) - _SPARE, 0)
+    bottom, right = around.max(axis=(1, 2)).astype(int) + _SPARE + 1
+    region = np.asarray(closed.planes[index, first[0] : bottom, first[1] : right], dtype=np.float64)
+    down, along = (np.arange(n) / (2.0 * n) for n in region.shape)
+    sharp = fft.idctn(fft.dctn(region, norm="ortho") * inverse(down[:, None], along), norm="ortho")
+    spline = ndimage.spline_filter(sharp, order=5, mode="mirror")
+
+    def moved(shift: tuple[float, float], margin: int) -> NDArray[np.float64]:
+        at = places(shift, margin) - first[:, None, None]
+        return np.asarray(ndimage.map_coordinates(spline, at, order=5, prefilter=False, mode="mirror"))
+
+    f = fft.fftfreq(_NOISE_GRID)
+    power = np.square(inverse(f[:, None], f)) * closed.noise[index].variance(region.mean())
+    if closed.cfa is not None:  # what demosaicing made up is no noise
+        power_at = _power_by_frequency(moved((0.0, 0.0), 0))
+        for row, col in _ALIASES[channel]:
+            power -= _ALIASED * power_at(np.hypot((row - abs(f))[:, None], col - abs(f)))
     lags = np.arange(-(size - 1), size)
-    return np.asarray(fft.ifft2(power).real[np.ix_(lags, lags)])
+    return moved, fft.ifft2(power).real[np.ix_(lags, lags)]
 
 
 def _power_by_frequency(window: NDArray[np.floating]) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:

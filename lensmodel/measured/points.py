@@ -30,24 +30,20 @@ from lensmodel.core.psf import centred
 from lensmodel.core.types import CHANNELS, Channel, StepHook
 from lensmodel.measured.measurer import (
     NEAR_CLIP,
-    MeasuredPsf,
+    Found,
     Measurer,
     Prepared,
     Solved,
     Window,
-    psf_at,
     solve,
 )
 from lensmodel.photo import LinearPhoto
 
-# Error that no cell shows of itself (chosen): three times that of one kernel, which may change in the cell
-FLOOR: Final = 0.1
 _FEWEST: Final = 2  # Lights a cell must have: one alone may be a double star
 # Least share of lone bright spots (chosen: 30 photos have less than .04, stars .4; no command repeats it)
 _ISOLATED: Final = 0.05
 _MOST: Final = 12  # lights of a cell: more lower the noise no further (chosen)
 _ROUNDS: Final = 3  # of stacking at improved centres: soon they rest (chosen)
-_SURE: Final = 0.45  # expected error beyond which a kernel helps no model: blind ones are no worse (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +54,8 @@ class Points(Measurer):
     down: int = 5
 
     name: ClassVar[str] = "points"
-    version: ClassVar[int] = 1
-    photos: ClassVar[int] = 1
-
+    floor: ClassVar[float] = 0.1  # three times that of one kernel, which may change in the cell (chosen)
+    most: ClassVar[float] = 0.45
     nothing: ClassVar[str] = (
         "what looks like points of light gives no PSF: they are too faint, or parts of an ordinary scene; "
         "photograph stars or pinholes before a dark ground, and expose longer"
@@ -140,7 +135,7 @@ def _cell_psf(
     lights: Sequence[tuple[float, float]],
     size: int,
     sky: NDArray[np.float64],
-) -> MeasuredPsf:
+) -> Found:
     """Stack the lights of a cell, and solve for their kernel."""
     stamps = [_stamp(photo, channel, light, size, sky) for light in lights]
     stamps = [stamp for stamp in stamps if stamp.flux > 0.0 and stamp.window.measured.sum() > size]
@@ -155,10 +150,9 @@ def _cell_psf(
         if (rest := _unexplained(moved, again)) >= left:
             break
         stamps, solved, left = moved, again, rest
-    error = math.hypot(solved.error, FLOOR, left)
     weights = np.array([stamp.flux for stamp in stamps])
     middle = np.average([stamp.pixel for stamp in stamps], axis=0, weights=weights)
-    return psf_at(photo, channel, centred(solved.kernel), middle, size, error, _SURE)
+    return Found(centred(solved.kernel), math.hypot(solved.error, left), middle, size)
 
 
 def _stamp(

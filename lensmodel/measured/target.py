@@ -35,7 +35,6 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageOps
 from scipy import fft, ndimage, signal
@@ -46,12 +45,10 @@ from lensmodel.core.files import atomic
 from lensmodel.core.types import Channel, Kernel, StepHook
 from lensmodel.measured.measurer import (
     SMALL,
-    MeasuredPsf,
+    Found,
     Measurer,
     Prepared,
-    Solved,
     Window,
-    quadratic,
     roughly,
     window_corners,
     window_psf,
@@ -109,17 +106,11 @@ class TargetPage:
         return self.detail // 16
 
     @property
-    def mark_radius(self) -> float:
-        """Radius of the discs in samples."""
-        return self.mark_side / 4.0
-
-    @property
     def marks(self) -> NDArray[np.float64]:
         """Middles of the discs `(4, 2)`: top left, top right, bottom right, bottom left."""
         near = self.border + self.mark_side / 2.0 - 0.5
-        top, left = near, near
         bottom, right = (length - 1 - near for length in self.shape)
-        return np.array([(top, left), (top, right), (bottom, right), (bottom, left)], dtype=np.float64)
+        return np.array([(near, near), (near, right), (bottom, right), (bottom, near)])
 
     @cached_property
     def samples(self) -> NDArray[np.float32]:
@@ -135,17 +126,14 @@ class TargetPage:
         for axis, length in enumerate(self.shape):  # band-limited
             fine = signal.resample(fine, length * DOTS, axis=axis)
         fine = np.clip(fine, 0.0, 1.0)
-        height, width = fine.shape
-        rows = np.arange(height, dtype=np.float32)[:, None] / DOTS
-        cols = np.arange(width, dtype=np.float32)[None, :] / DOTS
-        fine[~self._within(rows, cols, self.border - 0.25)] = 1.0
-        for row, col in self.marks:
+        rows, cols = (np.arange(n, dtype=np.float32) / DOTS for n in fine.shape)
+        fine[~self._within(rows[:, None], cols, self.border - 0.25)] = 1.0
+        for mark in self.marks:
             half = self.mark_side / 2.0
-            box = _slice(row, half, height), _slice(col, half, width)
-            fine[box] = 1.0
-            away = np.hypot(rows[box[0]] - row, cols[:, box[1]] - col)
+            box = tuple(slice(round((at - half) * DOTS), round((at + half) * DOTS) + 1) for at in mark)
+            away = np.hypot(rows[box[0], None] - mark[0], cols[box[1]] - mark[1])
             # the rim falls over one sample: a step would have frequencies that no pixel resolves
-            fine[box] -= np.clip(self.mark_radius + 0.5 - away, 0.0, 1.0).astype(np.float32)
+            fine[box] = 1.0 - np.clip(self.mark_side / 4.0 + 0.5 - away, 0.0, 1.0)
         return fine
 
     @cached_property
@@ -162,13 +150,9 @@ class TargetPage:
 
     def holds_noise(self, rows: NDArray[np.floating], cols: NDArray[np.floating]) -> bool:
         """Whether noise, and nothing else, lies at all of these places."""
-        if not bool(self._within(rows, cols, self.border + 1.0).all()):
-            return False
         half = self.mark_side / 2.0 + 1.0
-        return all(
-            not bool(((np.abs(rows - row) < half) & (np.abs(cols - col) < half)).any())
-            for row, col in self.marks
-        )
+        marked = [(np.abs(rows - row) < half) & (np.abs(cols - col) < half) for row, col in self.marks]
+        return bool((self._within(rows, cols, self.border + 1.0) & ~np.any(marked, axis=0)).all())
 
     def _within(
         self, rows: NDArray[np.floating], cols: NDArray[np.floating], border: float
@@ -177,10 +161,6 @@ class TargetPage:
         height, width = self.shape
         down = (rows > border) & (rows < height - 1 - border)
         return np.asarray(down & (cols > border) & (cols < width - 1 - border))
-
-
-def _slice(middle: float, half: float, length: int) -> slice:
-    return slice(max(round((middle - half) * DOTS), 0), min(round((middle + half) * DOTS) + 1, length))
 
 
 # Width and height in millimetres, lying (ISO 216, ANSI/ASME Y14.1)
@@ -224,10 +204,9 @@ def on_paper(path: Path, paper: str) -> tuple[float, float]:
 
 # --- its PSFs ------------------------------------------------------------------------------------
 
-FLOOR: Final = 0.02  # error that no window shows of itself: of the models of light, tones and place (chosen)
 _TOO_SMALL: Final = "the page is too small in the photo; go nearer until it nearly fills the frame"
 _SIDE: Final = 144  # pixels of a window: wide enough for the largest kernel, small enough for one (chosen)
-_SURE: Final = 0.3  # error beyond which a measurement is not worth having
+_FEWEST: Final = 64  # pixels of a window to fit its light to: five to ten for each term (chosen)
 _TONE_WINDOWS: Final = 6  # in the middle of the frame, where the lens is sharpest (chosen)
 _TRIED: Final = 6  # windows looked at along each axis for one that is measured: the page may end anywhere
 
@@ -243,9 +222,8 @@ class Target(Measurer):
     details: tuple[int, ...] = DETAILS  # pages that it may be, by the samples along their long side
 
     name: ClassVar[str] = "target"
-    version: ClassVar[int] = 1
-    photos: ClassVar[int] = 1
-
+    floor: ClassVar[float] = 0.02  # of the models of light, tones and place (chosen)
+    most: ClassVar[float] = 0.3
     nothing: ClassVar[str] = "no window of the page determines a PSF; is the photo in focus?"
 
     def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
@@ -264,12 +242,13 @@ class Target(Measurer):
             raise NotEnoughEvidenceError(_TOO_SMALL)
         corners = _spread(held, across, down)
         middle = sorted(corners, key=lambda c: np.hypot(*(np.add(c, self.side / 2) - photo.frame.center)))
-        tones = tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side, on_step)
+        tones = _tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side, on_step)
         placed = replace(placed, tones=tones)
 
-        def psf_in(corner: tuple[int, int], channel: Channel) -> MeasuredPsf:
-            best = solve_window(Window.of(photo, channel, corner, self.side), placed, size)
-            return best.window.psf(best.kernel, best.solved.error, FLOOR, _SURE)
+        def psf_in(corner: tuple[int, int], channel: Channel) -> Found:
+            window = Window.of(photo, channel, corner, self.side)
+            kernel, error, *_ = _solved(window, placed, size)
+            return Found(kernel, error, window.middle, self.side)
 
         return corners, psf_in
 
@@ -325,9 +304,9 @@ def _spread(held: Sequence[tuple[int, int]], across: int, down: int) -> list[tup
     return sorted({held[int(np.argmin(np.hypot(*(places - place).T)))] for place in wanted})
 
 
-# Standard deviation of q and c, see `tones_of` (chosen: a gamma of 1.3 has a q of 0.3)
+# Standard deviation of q and c, see `_tones_of` (chosen: a gamma of 1.3 has a q of 0.3)
 TONE_SPREAD: Final = 0.3
-# z, z² and z³ of `tones_of` in powers of R, less their constants
+# z, z² and z³ of `_tones_of` in powers of R, less their constants
 _POWERS: Final = ((1.0, 0.0, 0.0), (-2.0 * MEAN, 1.0, 0.0), (3.0 * MEAN**2, -3.0 * MEAN, 1.0))
 _TINY: Final = 1e-20  # keeps a division finite
 _FINE: Final = 2  # samples a pixel that the page is drawn with: at 1, its dots would alias (chosen for time)
@@ -354,7 +333,7 @@ class PlacedPage:
         down, along = (tukey(n * _FINE, 2.0 * _SPARE / n).astype(np.float32) for n in sides)
         plane *= down[:, None] * along
         for axis, n in enumerate(sides):
-            plane = scipy.signal.resample(plane, n, axis=axis)
+            plane = signal.resample(plane, n, axis=axis)
         inner = plane[_SPARE : _SPARE + shape[0], _SPARE : _SPARE + shape[1]]
         return np.ascontiguousarray(inner + MEAN, dtype=np.float32)
 
@@ -364,19 +343,10 @@ class PlacedPage:
         return self.page.holds_noise(*self.warp(*np.meshgrid(row + steps, col + steps, indexing="ij")))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SolvedWindow:
-    """A solved window: kernel, the solution it came from, how far the page was moved, and its light."""
-
-    window: Window
-    kernel: NDArray[np.float64]
-    solved: Solved
-    shift: tuple[float, float]
-    light: NDArray[np.float64]  # (6,), terms of `window_terms`
-
-
-def solve_window(window: Window, placed: PlacedPage, size: int) -> SolvedWindow:
-    """Find the light and the kernel of size `size` of a window of the page."""
+def _solved(
+    window: Window, placed: PlacedPage, size: int
+) -> tuple[Kernel, float, tuple[float, float], NDArray[np.float64]]:
+    """Kernel of a window of the page, its error, how far the page was moved, and terms (6,) of its light."""
     (row, col), side = window.corner, len(window.light)
 
     def page(shift: tuple[float, float], margin: int) -> NDArray[np.float32]:
@@ -388,12 +358,11 @@ def solve_window(window: Window, placed: PlacedPage, size: int) -> SolvedWindow:
 
     light = np.eye(6)[0]
     rough, shift = roughly(window, lit)
-    light = _fitted_light(window, page(shift, SMALL // 2), rough.kernel)
-    kernel, solved, shift = window_psf(window, lit, size)
-    return SolvedWindow(window, kernel, solved, shift, light)
+    light = _fitted_light(window, page(shift, SMALL // 2), rough)
+    return *window_psf(window, lit, size), light
 
 
-def tones_of(
+def _tones_of(
     photo: LinearPhoto,
     placed: PlacedPage,
     corners: Sequence[tuple[int, int]],
@@ -424,19 +393,12 @@ def tones_of(
 def _tones_in(window: Window, placed: PlacedPage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Precision (2, 2) and value (2,) of (q, c) in one window."""
     side, half, (row, col), good = len(window.light), SMALL // 2, window.corner, window.measured
-    solved = solve_window(window, placed, SMALL)
-    light, kernel = window_terms(side, half) @ solved.light, solved.kernel
-    start = row - half - solved.shift[0], col - half - solved.shift[1]
-    shape = side + 2 * half, side + 2 * half
-    columns = [
-        scipy.signal.fftconvolve(
-            replace(placed, tones=tones).window(*start, shape) * light, kernel, mode="valid"
-        )
-        for tones in _POWERS
-    ]
-    t = np.linspace(-1.0, 1.0, side)
-    columns += list(np.moveaxis(quadratic(t[:, None], t[None, :]), -1, 0))
-    basis, observed = np.stack([column[good] for column in columns], axis=-1), window.light[good]
+    kernel, _, shift, terms = _solved(window, placed, SMALL)
+    light, outer = window_terms(side, half) @ terms, (side + 2 * half,) * 2
+    start = row - half - shift[0], col - half - shift[1]
+    pages = [replace(placed, tones=tones).window(*start, outer) * light for tones in _POWERS]
+    blurred = [signal.fftconvolve(page, kernel, mode="valid")[good] for page in pages]
+    basis, observed = np.column_stack([*blurred, window_terms(side, 0)[good]]), window.light[good]
     terms, *_ = np.linalg.lstsq(basis, observed, rcond=None)
     if not terms[0] > 0.0:
         raise NotEnoughEvidenceError("a window shows a negative of the page")
@@ -449,11 +411,12 @@ def _tones_in(window: Window, placed: PlacedPage) -> tuple[NDArray[np.float64], 
 
 def _fitted_light(window: Window, page: NDArray[np.floating], kernel: Kernel) -> NDArray[np.float64]:
     """Terms (6,) of a quadratic in row and column, whose mean over its square window is 1."""
-    side, measured = len(window.light), window.require_measured()
-    outer, inner = window_terms(side, kernel.shape[0] // 2), window_terms(side, 0)
-    lit = [scipy.signal.fftconvolve(page * outer[..., j], kernel, mode="valid")[measured] for j in range(6)]
-    basis = np.stack([*lit, *inner[measured].T], axis=-1)
-    terms, *_ = np.linalg.lstsq(basis, window.light[measured], rcond=None)
+    side, good = len(window.light), window.measured
+    if int(good.sum()) < _FEWEST:
+        raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
+    outer, inner = window_terms(side, len(kernel) // 2), window_terms(side, 0)
+    lit = [signal.fftconvolve(page * outer[..., j], kernel, mode="valid")[good] for j in range(6)]
+    terms, *_ = np.linalg.lstsq(np.column_stack([*lit, inner[good]]), window.light[good], rcond=None)
     light = inner @ terms[:6]
     if not float(light.min()) > 0.0:
         raise NotEnoughEvidenceError("a window of the page is black, or does not show the page; light it")

@@ -25,7 +25,7 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centred, resized
 from lensmodel.core.types import Frame, Kernel, LensSettings, NoiseModel, StepHook, ignore_step
 from lensmodel.measured.edges import SlantedEdges, squares_of
-from lensmodel.measured.measurer import Measurer, Prepared, psf_at, solve
+from lensmodel.measured.measurer import Found, Measurer, Prepared, solve
 from lensmodel.measured.pair import AperturePair, diffraction_otf
 from lensmodel.measured.points import Points, find_lights, isolated_lights
 from lensmodel.measured.registration import homography_of, match
@@ -260,14 +260,14 @@ def test_a_match_says_how_far_the_photo_lies_beyond(shift: tuple[int, int]) -> N
 
 def test_a_psf_whose_error_is_not_known_is_left_out_and_the_others_stay() -> None:
     class Sure(Measurer):
-        name, version, photos, nothing = "sure", 1, 1, "nowhere"
+        name, floor, most, nothing = "sure", 0.0, 0.5, "nowhere"
 
         def __init__(self, *errors: float) -> None:
             self.errors = errors
 
         def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
-            kernel, at = gaussian(size, np.eye(2)), np.array([30.0, 30.0])
-            return self.errors, lambda error, channel: psf_at(photos[0], channel, kernel, at, 9, error, 0.5)
+            kernel = gaussian(size, np.eye(2))
+            return self.errors, lambda error, _: Found(kernel, error, (30.0, 30.0), 9)
 
     photo = photo_of(np.full((128, 128), 0.3), gaussian(5, np.eye(2)))
     found = Sure(math.nan, 0.1, 0.6).measure([photo], size=9, channels=("g",))

@@ -6,11 +6,11 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from functools import partial
-from itertools import zip_longest
+from itertools import chain, count
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -44,6 +44,8 @@ PROFILES: Final = "lenses"
 LEARN_FROM: Final = 8
 # Expected error of the PSFs from which on a small gain is for want of knowledge (chosen)
 _UNSURE: Final = 0.5
+# Facts of a corrected photo that its result repeats
+_FOUND: Final = ("expected_gain_db", "zones", "nothing_to_correct", "audit", "chroma_step")
 _SAID: Final = 3  # photos of a group that are left for one reason and named (chosen); -v names all
 # Columns for the names of a group (chosen): with them the table fits a terminal of 80
 _LENS_WIDTH: Final = 26
@@ -176,25 +178,19 @@ def targets_of(
     `output` is that file itself where there is one photo and the name ends as a picture's does; where it ends
     in a separator or is a folder already, it is a folder.
     """
-    extension = EXTENSION[file_format]
-    if output is not None and len(paths) == 1 and _names_a_picture(output):
-        target = Path(output)
-        if file_format is not None and EXTENSION[FORMATS[target.suffix.lower()]] != extension:
-            raise UsageError(f"{target.name} is no name for --format {file_format}; end it in {extension}")
-        return {paths[0]: target}
+    extension, named = EXTENSION[file_format], Path(output or FOLDER)
+    a_file = named.suffix.lower() in FORMATS and not (named.is_dir() or str(output).endswith(os.sep))
+    if len(paths) == 1 and a_file:
+        if file_format is not None and EXTENSION[FORMATS[named.suffix.lower()]] != extension:
+            raise UsageError(f"{named.name} is no name for --format {file_format}; end it in {extension}")
+        return {paths[0]: named}
     targets = {}
     for path in paths:
-        folder = path.parent / FOLDER if output is None else Path(output)
+        folder = path.parent / FOLDER if output is None else named
         if folder.exists() and not folder.is_dir():
             raise UsageError(f"{folder} is a file; give a folder to -o")
         targets[path] = folder / f"{path.stem}{CORRECTED}{extension}"
     return targets
-
-
-def _names_a_picture(output: str) -> bool:
-    return (
-        Path(output).suffix.lower() in FORMATS and not output.endswith(os.sep) and not Path(output).is_dir()
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,35 +209,32 @@ class Correction:
         """Correct the photos of a lens, one after the other; return what became of each, and tell it."""
         results: list[dict[str, Any]] = []
         left: Counter[str] = Counter()
-        with self.display.progress(total=len(paths)) as bar:
+        display = self.display
+        tell = display.detail if self.sorted else display.note
+        with display.progress(total=len(paths)) as bar:
             for number, path in enumerate(paths):
                 bar.show(description=f"correcting {path.name}")
                 target = self.targets[path]
                 result = self._photo(path, target, lens, partial(bar.part, number))
-                left[result.get("reason", "")] += 1
-                self._tell(path, target, result, known=left[result.get("reason", "")] > _SAID)
+                match result["state"]:
+                    case "failed":
+                        display.error(f"{path}: {result['reason']}")
+                    case "left":
+                        left[result["reason"]] += 1
+                        several = left[result["reason"]] > _SAID
+                        (tell if several else display.note)(f"{path}: left as it is: {result['reason']}")
+                    case "kept":
+                        tell(f"{target} is there already and was left alone; --force replaces it")
+                    case _:
+                        if self.sorted:
+                            tell(f"{target}: {gain_words(result['expected_gain_db'])} expected")
+                        else:
+                            display.result(str(target))
+                        if result["nothing_to_correct"]:
+                            tell(f"{path.name}: nothing to correct, its pixels stayed as they were")
                 results.append({"photo": str(path), "output": str(target), **result})
                 bar.show(completed=number + 1)
         return results
-
-    def _tell(self, path: Path, target: Path, result: Mapping[str, Any], *, known: bool) -> None:
-        """Tell what became of a photo, with -v even why it is left where that is `known` of others."""
-        display = self.display
-        tell = display.detail if self.sorted else display.note
-        match result["state"]:
-            case "failed":
-                display.error(f"{path}: {result['reason']}")
-            case "left":
-                (tell if known else display.note)(f"{path}: left as it is: {result['reason']}")
-            case "kept":
-                tell(f"{target} is there already and was left alone; --force replaces it")
-            case _:
-                if self.sorted:
-                    tell(f"{target}: {gain_words(result['expected_gain_db'])} expected")
-                else:
-                    display.result(str(target))
-                if result["nothing_to_correct"]:
-                    tell(f"{path.name}: nothing to correct, its pixels stayed as they were")
 
     def _photo(self, path: Path, target: Path, lens: Lens | None, on_step: StepHook) -> dict[str, Any]:
         """Correct one photo; return what became of it: `corrected`, `kept`, `left` or `failed`."""
@@ -269,14 +262,7 @@ class Correction:
             )
         except (LensModelError, OSError) as error:
             return files.failed(error)
-        result = {
-            "state": "corrected",
-            "expected_gain_db": corrected.expected_gain_db,
-            "zones": corrected.zones,
-            "nothing_to_correct": corrected.nothing_to_correct,
-            "audit": corrected.audit,
-            "chroma_step": corrected.chroma_step,
-        }
+        result = {"state": "corrected", **{name: getattr(corrected, name) for name in _FOUND}}
         if least is not None and corrected.expected_gain_db < least:
             insist = "" if self.sorted else "; --force corrects it all the same"
             result |= {"state": "left", "reason": f"{_why_left(corrected, lossy=lossy)}{insist}"}
@@ -332,9 +318,8 @@ class Shot:
     def of(cls, path: Path) -> Shot:
         """Read the header of a photo."""
         info = inspect(path)
-        pitch = info.metadata.pixel_pitch_um or 0.0
-        half = math.hypot(info.width, info.height) / 2.0 * pitch / 1000.0
-        return cls(path, info.metadata, half)
+        pitch_mm = (info.metadata.pixel_pitch_um or 0.0) / 1000.0
+        return cls(path, info.metadata, pitch_mm * math.hypot(info.width, info.height) / 2.0)
 
     @property
     def owner(self) -> tuple[str, ...]:
@@ -346,9 +331,9 @@ class Shot:
         return (*lens, name_key(said.camera_model), serial_key(said.body_serial))
 
     @property
-    def names_lens(self) -> bool:
-        """Whether the file says which lens it was."""
-        return Identity.of(self.metadata).names_lens
+    def focal_mm(self) -> float:
+        """The focal length, 0 where the file does not say it."""
+        return self.metadata.focal_mm or 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -362,103 +347,75 @@ class PhotoGroup:
     name: str
 
     @property
-    def camera(self) -> str:
-        """The bodies in words."""
+    def words(self) -> dict[str, str]:
+        """Bodies, lens and focal length in words; its serial shortened, as tables are shown around."""
         said = [shot.metadata for shot in self.shots]
-        names = (camera_name(one.camera_maker, one.camera_model) or "unknown camera" for one in said)
-        return ", ".join(dict.fromkeys(names))
-
-    @property
-    def lens(self) -> str:
-        """The lens in words; its serial shortened, as tables are shown around."""
-        said = self.shots[0].metadata.lens
-        serial = f" #{said.serial[-4:]}" if said.serial else ""
-        return f"{said.model or 'unknown lens'}{serial}"
-
-    @property
-    def focal(self) -> str:
-        """The focal length in words."""
-        known = [shot.metadata.focal_mm for shot in self.shots if shot.metadata.focal_mm]
-        if not known:
-            return "unknown focal length"
-        low, high = f"{min(known):.3g}", f"{max(known):.3g}"
-        return f"{low} mm" if low == high else f"{low}-{high} mm"
-
-    @property
-    def paths(self) -> list[Path]:
-        """The files."""
-        return [shot.path for shot in self.shots]
-
-    def profile_in(self, folder: Path) -> Path:
-        """The file of its lens."""
-        return folder / f"{self.name}.lensprofile"
+        cameras = (camera_name(one.camera_maker, one.camera_model) or "unknown camera" for one in said)
+        lens, known = said[0].lens, [shot.focal_mm for shot in self.shots if shot.focal_mm]
+        ends = dict.fromkeys(f"{end(known):.3g}" for end in (min, max)) if known else ()
+        return {
+            "camera": ", ".join(dict.fromkeys(cameras)),
+            "lens": (lens.model or "unknown lens") + (f" #{lens.serial[-4:]}" if lens.serial else ""),
+            "focal_length": f"{'-'.join(ends)} mm" if known else "unknown focal length",
+        }
 
     @property
     def scenes(self) -> int:
         """How many different things the photos show: the frames of a burst are one."""
-        return len(_bursts(self.shots)[0])
+        return len(self.shots) - len(self._repeated())
 
-    def to_learn_from(self) -> list[Shot]:
+    def to_learn_from(self) -> list[Path]:
         """Return the photos in the order in which they tell most: each aperture's first one, then the second.
 
-        A photo whose aperture is unknown comes last, and later frames of a burst after all (`scenes`).
+        A photo whose aperture is unknown is the last of its turn; later frames of a burst come after all.
         """
-        first, again = _bursts(self.shots)
-        return [*_by_aperture(first), *_by_aperture(again)]
+        repeated, turns = self._repeated(), Counter[tuple[bool, float]]()
+        order = []
+        # a smaller frame is the middle of what the lens draws: the largest ones tell of all of it
+        for shot in sorted(self.shots, key=lambda shot: -round(shot.half_diagonal_mm)):
+            again, aperture = shot.path in repeated, shot.metadata.aperture or math.inf
+            order.append((again, turns[again, aperture], aperture, shot.path))
+            turns[again, aperture] += 1
+        return [path for *_, path in sorted(order)]
 
-
-def _by_aperture(shots: Sequence[Shot]) -> list[Shot]:
-    by_aperture: dict[float, list[Shot]] = {}
-    # a smaller frame is the middle of what the lens draws: the largest ones tell of all of it
-    for shot in sorted(shots, key=lambda shot: -round(shot.half_diagonal_mm)):
-        by_aperture.setdefault(shot.metadata.aperture or math.inf, []).append(shot)
-    turns = zip_longest(*(by_aperture[aperture] for aperture in sorted(by_aperture)))
-    return [shot for turn in turns for shot in turn if shot is not None]
-
-
-def _bursts(shots: Sequence[Shot]) -> tuple[list[Shot], list[Shot]]:
-    """Part the photos into the first of each burst, and those that follow it at the same settings."""
-    parts: tuple[list[Shot], list[Shot]] = [], []
-    last: dict[tuple[float | None, float | None], datetime] = {}
-    for shot in sorted(shots, key=lambda shot: (shot.metadata.taken_at or datetime.min, shot.path)):  # noqa: DTZ901  cameras' clocks have no zone
-        said = shot.metadata
-        settings, time = (said.aperture, said.focal_mm), said.taken_at
-        follows = time is not None and settings in last and time - last[settings] <= BURST
-        parts[follows].append(shot)
-        if time is not None:
+    def _repeated(self) -> set[Path]:
+        """Later frames of a burst: those that soon follow one at the same settings."""
+        repeated: set[Path] = set()
+        last: dict[tuple[float | None, float], datetime] = {}
+        timed = [(shot.metadata.taken_at, shot.path, shot) for shot in self.shots if shot.metadata.taken_at]
+        for time, path, shot in sorted(timed, key=lambda each: each[:2]):
+            settings = shot.metadata.aperture, shot.focal_mm
+            if settings in last and time - last[settings] <= BURST:
+                repeated.add(path)
             last[settings] = time
-    return sorted(parts[0], key=lambda shot: shot.path), sorted(parts[1], key=lambda shot: shot.path)
+        return repeated
 
 
 def groups(shots: Iterable[Shot]) -> list[PhotoGroup]:
     """Sort photos by body, lens and focal length; lengths within `SAME_FOCAL` of the shortest are one."""
     runs: list[tuple[str, list[Shot]]] = []
-    for shot in sorted(shots, key=lambda shot: (shot.owner, shot.metadata.focal_mm or 0.0)):
+    for shot in sorted(shots, key=lambda shot: (shot.owner, shot.focal_mm)):
         name, run = runs[-1] if runs else ("", [])
         same = bool(run) and run[0].owner == shot.owner
-        if same and (shot.metadata.focal_mm or 0.0) <= (run[0].metadata.focal_mm or 0.0) * SAME_FOCAL:
+        if same and shot.focal_mm <= run[0].focal_mm * SAME_FOCAL:
             run.append(shot)
             continue
-        if not (same and shot.names_lens):
-            name = _free(_name(shot), {taken for taken, _ in runs})
+        names_lens = Identity.of(shot.metadata).names_lens
+        if not (same and names_lens):
+            name = _name(shot, {taken for taken, _ in runs}, focal=not names_lens)
         runs.append((name, [shot]))
     return [PhotoGroup(tuple(sorted(run, key=lambda shot: shot.path)), name) for name, run in runs]
 
 
-def _name(shot: Shot) -> str:
+def _name(shot: Shot, taken: Collection[str], *, focal: bool) -> str:
+    """Name a profile; two copies whose serials end alike get a number."""
     said = shot.metadata
-    focal = f"{said.focal_mm:g}mm" if said.focal_mm and not shot.names_lens else None
-    words = [said.camera_model, said.lens.model, said.lens.serial and said.lens.serial[-4:], focal]
+    length = f"{said.focal_mm:g}mm" if said.focal_mm and focal else None
+    words = [said.camera_model, said.lens.model, said.lens.serial and said.lens.serial[-4:], length]
     plain = re.sub(r"[^\w.+-]+", "-", "-".join(word for word in words if word)).strip("-.")
-    return plain[:MOST_IN_NAME] or "unknown-camera"
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """Two copies whose serials end alike get a number."""
-    number, free = 2, name
-    while free in taken:
-        free, number = f"{name}-{number}", number + 1
-    return free
+    name = plain[:MOST_IN_NAME] or "unknown-camera"
+    numbered = (f"{name}-{number}" for number in count(2))
+    return next(free for free in chain([name], numbered) if free not in taken)
 
 
 def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[str, Any]:
@@ -476,14 +433,28 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
         except (LensModelError, OSError) as error:
             results.append({"photo": str(path), "output": None, **files.failed(error)})
             display.error(f"{path}: {reason(error)}")
-    lens_groups = groups(shots)  # those of a zoom have one profile: all are learned before any is corrected
-    learned = [_learn(group, group.profile_in(profiles), most, correction) for group in lens_groups]
-    for group, count in zip(lens_groups, learned, strict=True):
-        target = group.profile_in(profiles)
-        lens = Lens(files.profile_at(target)) if target.exists() else None
-        done = correction.photos(group.paths, lens)
+    lens_groups = [(group, profiles / f"{group.name}.lensprofile") for group in groups(shots)]
+    # those of a zoom have one profile: all are learned before any is corrected
+    learned = [_learn(group, profile, most, correction) for group, profile in lens_groups]
+    for (group, profile), number in zip(lens_groups, learned, strict=True):
+        lens = Lens(files.profile_at(profile)) if profile.exists() else None
+        done = correction.photos([shot.path for shot in group.shots], lens)
         results += done
-        rows.append(_row(group, None if lens is None else target, count, done))
+        states = Counter(result["state"] for result in done)
+        gains = [result["expected_gain_db"] for result in done if result["state"] == "corrected"]
+        rows.append(
+            {
+                **group.words,
+                "profile": None if lens is None else str(profile),
+                "photos": len(done),
+                "learned_from": number,
+                "corrected": states["corrected"],
+                "corrected_before": states["kept"],
+                "left": states["left"],
+                "failed": states["failed"],
+                "expected_gain_db": sum(gains) / len(gains) if gains else None,  # of this run
+            }
+        )
     if rows:
         display.result(table_of(rows))
     for row in rows:
@@ -504,7 +475,7 @@ def _learn(group: PhotoGroup, profile: Path, most: int, correction: Correction) 
     store = files.ProfileFile(profile)
     config = configured(store.model, LensSettings(aperture=correction.options["aperture"]))
     calibration = Calibration(store, config, any_lens=correction.any_lens)
-    paths = [shot.path for shot in group.to_learn_from()]
+    paths = group.to_learn_from()
     with display.progress("learning", total=most) as bar:
 
         def on_event(event: CalibrationEvent) -> None:
@@ -523,29 +494,9 @@ def _learn(group: PhotoGroup, profile: Path, most: int, correction: Correction) 
     if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
         reasons = set(map(str, refused))
         why = f" ({reasons.pop()})" if len(reasons) == 1 else ""
-        display.note(f"{group.lens}, {group.focal}: no photo shows enough to learn its blur from{why}")
+        what = f"{group.words['lens']}, {group.words['focal_length']}"
+        display.note(f"{what}: no photo shows enough to learn its blur from{why}")
     return counted
-
-
-def _row(
-    group: PhotoGroup, profile: Path | None, learned: int, results: Sequence[Mapping[str, Any]]
-) -> dict[str, Any]:
-    """Say what became of the photos of a group."""
-    states = Counter(result["state"] for result in results)
-    gains = [result["expected_gain_db"] for result in results if result["state"] == "corrected"]
-    return {
-        "camera": group.camera,
-        "lens": group.lens,
-        "focal_length": group.focal,
-        "profile": None if profile is None else str(profile),
-        "photos": len(group.shots),
-        "learned_from": learned,
-        "corrected": states["corrected"],
-        "corrected_before": states["kept"],
-        "left": states["left"],
-        "failed": states["failed"],
-        "expected_gain_db": sum(gains) / len(gains) if gains else None,  # of this run
-    }
 
 
 def table_of(rows: Iterable[Mapping[str, Any]]) -> Table:

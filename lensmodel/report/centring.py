@@ -23,8 +23,7 @@ patches of one photo do not prove a fault of the lens.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
@@ -87,20 +86,25 @@ class Centring:
 
 
 def centring(model: LensModel, settings: LensSettings) -> Centring:
-    """Judge the centring of a copy from the samples near some settings."""
-    samples = _near(model, settings)
+    """Judge the centring of a copy from the samples of one colour near an aperture."""
+    stops = settings.stops
+    samples = [
+        s
+        for s in model.samples
+        if s.weight > 0  # of a photo that counts
+        and s.settings.channel == settings.channel
+        and (stops is None or s.settings.stops is None or abs(s.settings.stops - stops) <= _NEAR_STOPS)
+    ]
     if len(samples) < _FEWEST:
         few = f"{len(samples)} sample{'' if len(samples) == 1 else 's'}"
         return Centring("unknown", f"{few} cannot tell whether the lens is centred; it takes {_FEWEST}")
     h = np.array([s.position.xy for s in samples])  # (right, up)
     r = np.hypot(*h.T)
-    widths = [rms_width(s.kernel) for s in samples]
     photos = np.unique([s.photo for s in samples], return_inverse=True)[1]
-    root = np.sqrt(np.array([s.weight for s in samples]))[:, None]
-    slope = np.concatenate([h, np.stack([r ** (2 * k) for k in range(3)], axis=1)], axis=1)
-    softer = _asymmetry((root * slope)[:, None], root * np.log(np.maximum(widths, 1e-3))[:, None], photos)
-    softer = replace(softer, amount=2.0 * EDGE_R * softer.amount, error=2.0 * EDGE_R * softer.error)
-    coma = None
+    root = np.sqrt([s.weight for s in samples])[:, None]
+    widths = np.maximum([rms_width(s.kernel) for s in samples], 1e-3)
+    slope = np.column_stack([h / (2.0 * EDGE_R), r**0, r**2, r**4])
+    softer, coma = _asymmetry((root * slope)[:, None], root * np.log(widths)[:, None], photos), None
     inner = np.flatnonzero(r < _MIDDLE_R)
     if len(inner) >= _FEWEST // 2:
         third = np.array([_third_moment(samples[i]) for i in inner])
@@ -110,79 +114,61 @@ def centring(model: LensModel, settings: LensSettings) -> Centring:
     return _verdict(softer, coma, int(photos.max()) + 1, measured=measured)
 
 
-def _near(model: LensModel, settings: LensSettings) -> list[PsfSample]:
-    """Samples of the colour near the aperture, none of photos that do not count."""
-
-    def near(sample: PsfSample) -> bool:
-        own, asked = sample.settings.stops, settings.stops
-        return own is None or asked is None or abs(own - asked) <= _NEAR_STOPS
-
-    counted = [s for s in model.samples if s.weight > 0]
-    return [s for s in counted if s.settings.channel == settings.channel and near(s)]
-
-
 def _third_moment(sample: PsfSample) -> _Array:
     """<|x|^2 x> / w^3 as (right, up), about the centre of mass, wings below a hundredth cut."""
     kernel = np.where(sample.kernel > WING_LEVEL * sample.kernel.max(), sample.kernel, 0.0)
     kernel = kernel / kernel.sum()
     down, right = np.indices(kernel.shape) - kernel.shape[0] // 2
-    up, right = (kernel * down).sum() - down, right - (kernel * right).sum()
-    squared = up**2 + right**2
+    x = np.stack([right - (kernel * right).sum(), (kernel * down).sum() - down])
+    squared = (x**2).sum(axis=0)
     width = math.sqrt(max(float((kernel * squared).sum()) / 2.0, 1e-6))
-    return np.array([(kernel * squared * right).sum(), (kernel * squared * up).sum()]) / width**3
+    return np.asarray((kernel * squared * x).sum(axis=(1, 2)) / width**3)
 
 
 def _asymmetry(design: _Array, value: _Array, photos: NDArray[np.intp]) -> Asymmetry:
-    """First two unknowns of equations (sample, each, unknown), with their error.
+    """First two unknowns of weighted equations (sample, each, unknown), with their jackknife error.
 
-    The error is the larger of those that leaving out samples and photos show.
+    It is the larger one of leaving out each sample and each photo.
     """
 
     def fit(rows: NDArray[np.bool_]) -> _Array:
         equations = design[rows].reshape(-1, design.shape[2])
         return np.asarray(np.linalg.lstsq(equations, value[rows].ravel(), rcond=None)[0])[:2]
 
-    vector = fit(np.ones(len(photos), dtype=np.bool_))
-    groups = [np.arange(len(photos)), *([photos] if len(np.unique(photos)) > 1 else [])]
-    error, freedom = max(_jackknife(fit, each) for each in groups)
-    length = float(np.hypot(*vector))
+    errors = []
+    for groups in (np.arange(len(photos)), photos):
+        names = np.unique(groups)
+        if (n := len(names)) > 1:
+            others = np.array([fit(groups != name) for name in names])
+            errors.append((math.sqrt((n - 1) * float(others.var(axis=0).mean())), n - 1))
+    error, freedom = max(errors)
+    right, up = fit(np.ones(len(photos), dtype=np.bool_)).tolist()
     # |g|^2 / (2 s^2) is distributed as F with 2 and 2 (n - 1) degrees where there is only chance
-    limit = math.sqrt(2.0 * float(special.fdtri(2.0, 2.0 * max(freedom, 1), 1.0 - _CHANCE)))
-    direction = math.atan2(float(vector[1]), float(vector[0]))
-    return Asymmetry(length, direction, error, significant=length > limit * error)
-
-
-def _jackknife(fit: Callable[[NDArray[np.bool_]], _Array], groups: NDArray[np.intp]) -> tuple[float, int]:
-    """Standard error of a component and the degrees of freedom, leaving out one group at a time."""
-    names = np.unique(groups)
-    others = np.array([fit(groups != name) for name in names])
-    n = len(names)
-    variance = (n - 1) / n * ((others - others.mean(axis=0)) ** 2).sum(axis=0)
-    return math.sqrt(float(variance.mean())), n - 1
+    limit = math.sqrt(2.0 * float(special.fdtri(2.0, 2.0 * freedom, 1.0 - _CHANCE)))
+    length = math.hypot(right, up)
+    return Asymmetry(length, math.atan2(up, right), error, significant=length > limit * error)
 
 
 def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int, *, measured: bool = False) -> Centring:
     photographs = "one photo" if photos == 1 else f"{photos} photos"
+    sides, spread = math.expm1(softer.amount), math.expm1(2.0 * softer.error)
+    figures = f"opposite sides differ by {sides:.0%}, give or take {spread:.0%}"
     signs = []
     if softer.significant and softer.amount > _SOFTER:
-        ratio, more = math.exp(softer.amount), math.exp(softer.amount + softer.error)
+        more = math.exp(softer.amount + softer.error) - math.exp(softer.amount)
         signs.append(
             f"the {direction_in_words(softer.direction)} is softer than the opposite side, "
-            f"its blur {ratio:.2f} times as wide, give or take {more - ratio:.2f}"
+            f"its blur {1.0 + sides:.2f} times as wide, give or take {more:.2f}"
         )
     if coma is not None and coma.significant and coma.amount > _COMATIC:
         tails = direction_in_words(coma.direction)
         signs.append(f"points in the middle of the picture have tails towards the {tails}")
-    sides, spread = math.expm1(softer.amount), math.expm1(2.0 * softer.error)
-    figures = f"opposite sides differ by {sides:.0%}, give or take {spread:.0%}"
     verdict: Literal["centred", "decentred", "unknown"] = "unknown"
-    if signs and photos == 1:
-        text = (
-            f"perhaps decentred: {'; '.join(signs)}; one photo cannot tell this from a subject at a slant; "
-        )
-        text += "a second one can"
+    text = f"decentred: {'; '.join(signs)}"
+    if signs and photos > 1:
+        verdict = "decentred"
     elif signs:
-        verdict, text = "decentred", f"decentred: {'; '.join(signs)}"
+        text = f"perhaps {text}; one photo cannot tell this from a subject at a slant; a second one can"
     # a subject at a slant may hide a fault as it may feign one; a chart was photographed straight on
     elif sides + spread <= _UNSURE and (photos > 1 or measured):
         verdict, text = "centred", f"well centred within what {photographs} can tell: {figures}"

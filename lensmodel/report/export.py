@@ -24,8 +24,8 @@ from lensmodel.core.files import write_atomically
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
-from lensmodel.report.centring import EDGE_R, Centring
-from lensmodel.report.lens_report import DEFAULT_ASPECT, UNIT_NAMES, ApertureReport, LensReport, grid
+from lensmodel.report.centring import EDGE_R
+from lensmodel.report.lens_report import DEFAULT_ASPECT, UNIT_NAMES, ApertureReport, LensReport, Spot, grid
 
 _HEAD: Final = (
     *("quantity", "aperture", "channel", "r", "phi", "row", "col", "frequency_c_px", "frequency_lp_mm"),
@@ -37,14 +37,15 @@ _MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the mem
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PsfGrid:
-    """Kernels at a grid of places, or at a single one."""
+    """Kernels at n = rows * cols places, row by row from the top left, or at a single one."""
 
-    kernels: NDArray[np.float32]  # (rows * cols, k, k), row by row from the top left
-    positions: tuple[FieldPosition, ...]
+    kernels: NDArray[np.float32]  # (n, k, k)
+    r: NDArray[np.float64]  # (n,), half-diagonals
+    phi: NDArray[np.float64]  # (n,), radians, counter-clockwise from the right
+    predicted_error: NDArray[np.float64]  # (n,), expected relative L2 of each kernel
     rows: int
     cols: int
     settings: LensSettings
-    predicted_error: tuple[float, ...]  # expected relative L2 of each kernel
 
 
 def psf_grid(
@@ -57,19 +58,25 @@ def psf_grid(
     aspect: float = DEFAULT_ASPECT,
     at: FieldPosition | None = None,
 ) -> PsfGrid:
-    """Ask a model for the kernels of a grid of places."""
-    places = grid(rows, cols, aspect) if at is None else (at,)
+    """Ask a model for the kernels of a grid of places, or of the place that is given."""
     if at is not None:
         rows = cols = 1
-    if size < 1 or 4 * len(places) * size * size > _MOST_BYTES:
+    if size < 1 or 4 * rows * cols * size * size > _MOST_BYTES:
         raise InvalidInputError(
             f"{rows} x {cols} kernels of side {size} are out of range; "
             f"ask for at most {_MOST_BYTES >> 20} MiB"
         )
+    places = grid(rows, cols, aspect) if at is None else (at,)
     answers = [model.query(place, settings, size) for place in places]
-    kernels = np.stack([answer.kernel for answer in answers]).astype(np.float32)
-    errors = tuple(float(answer.predicted_error) for answer in answers)
-    return PsfGrid(kernels, places, rows, cols, settings, errors)
+    return PsfGrid(
+        kernels=np.array([answer.kernel for answer in answers], dtype=np.float32),
+        r=np.array([place.r for place in places]),
+        phi=np.array([place.phi for place in places]),
+        predicted_error=np.array([answer.predicted_error for answer in answers]),
+        rows=rows,
+        cols=cols,
+        settings=settings,
+    )
 
 
 def to_fits(psfs: PsfGrid) -> bytes:
@@ -97,16 +104,13 @@ def to_fits(psfs: PsfGrid) -> bytes:
     if psfs.settings.focal_mm is not None:
         header["FOCALLEN"] = (psfs.settings.focal_mm, "focal length, mm")
     header["COMMENT"] = "point spread functions by lensmodel, sum 1"
-    table = fits.BinTableHDU.from_columns(
-        [
-            fits.Column("R", "D", unit="half-diagonal", array=[p.r for p in psfs.positions]),
-            fits.Column("PHI", "D", unit="rad", array=[p.phi for p in psfs.positions]),
-            fits.Column("ERROR", "D", array=list(psfs.predicted_error)),
-        ],
-        name="POSITIONS",
-    )
+    columns = [
+        fits.Column("R", "D", unit="half-diagonal", array=psfs.r),
+        fits.Column("PHI", "D", unit="rad", array=psfs.phi),
+        fits.Column("ERROR", "D", array=psfs.predicted_error),
+    ]
     out = io.BytesIO()
-    fits.HDUList([primary, table]).writeto(out)
+    fits.HDUList([primary, fits.BinTableHDU.from_columns(columns, name="POSITIONS")]).writeto(out)
     return out.getvalue()
 
 
@@ -117,11 +121,11 @@ def to_npz(psfs: PsfGrid) -> bytes:
     np.savez_compressed(
         out,
         psf=psfs.kernels,
-        r=np.array([p.r for p in psfs.positions]),
-        phi=np.array([p.phi for p in psfs.positions]),
-        error=np.array(psfs.predicted_error),
+        r=psfs.r,
+        phi=psfs.phi,
+        error=psfs.predicted_error,
         shape=np.array([psfs.rows, psfs.cols]),
-        aperture=np.full(len(psfs.positions), aperture),
+        aperture=np.full(len(psfs.r), aperture),
         channel=np.array(psfs.settings.channel),
     )
     return out.getvalue()
@@ -132,7 +136,7 @@ def to_json(psfs: PsfGrid) -> bytes:
     matrices = [[[float(f"{v:.9g}") for v in row] for row in kernel] for kernel in psfs.kernels]
     if len(matrices) == 1:
         return json.dumps(matrices[0], allow_nan=False).encode()
-    places = zip(psfs.positions, psfs.predicted_error, matrices, strict=True)
+    places = zip(psfs.r.tolist(), psfs.phi.tolist(), psfs.predicted_error.tolist(), matrices, strict=True)
     content = {
         "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
         "aperture": psfs.settings.aperture,
@@ -140,10 +144,7 @@ def to_json(psfs: PsfGrid) -> bytes:
         "channel": psfs.settings.channel,
         "rows": psfs.rows,
         "cols": psfs.cols,
-        "psfs": [
-            {"r": place.r, "phi": place.phi, "predicted_error": error, "kernel": matrix}
-            for place, error, matrix in places
-        ],
+        "psfs": [dict(zip(("r", "phi", "predicted_error", "kernel"), each, strict=True)) for each in places],
     }
     return json.dumps(content, allow_nan=False).encode()
 
@@ -175,8 +176,7 @@ def to_csv(report: LensReport) -> str:
     out = io.StringIO()
     writer = csv.DictWriter(out, _HEAD, restval="", lineterminator="\n")
     writer.writeheader()
-    rows = [row for found in report.tested for row in _rows(found)]
-    for row in rows:
+    for row in (row for found in report.tested for row in _rows(found)):
         writer.writerow(
             {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items() if v is not None}
         )
@@ -184,37 +184,35 @@ def to_csv(report: LensReport) -> str:
 
 
 def _rows(found: ApertureReport) -> Iterator[_Row]:
-    """What was found at one aperture in one colour, as figures with what is known of each."""
+    """What was found at one aperture in one colour, as figures with what is known of each.
+
+    Centring is the verdict as 0 or 1, and both signs of a fault with two standard errors and their direction.
+    """
     known: _Row = {"aperture": found.settings.aperture, "channel": found.settings.channel}
     for zone, value in found.zones.items():
         yield known | {"quantity": f"MTF50, mean of {zone}", "value": value, "unit": "c/px"}
     cells = [(divmod(i, found.cols), spot) for i, spot in enumerate(found.map)]
-    spots = [(known | {"quantity": f"MTF50 at {s.place}"}, s) for s in (*found.spots, *found.sides)]
-    spots += [(known | {"quantity": "MTF50", "row": row, "col": col}, s) for (row, col), s in cells]
+    spots: list[tuple[_Row, Spot]]
+    spots = [({"quantity": f"MTF50 at {s.place}"}, s) for s in (*found.spots, *found.sides)]
+    spots += [({"quantity": "MTF50", "row": row, "col": col}, s) for (row, col), s in cells]
     for own, spot in spots:
         own |= {"r": spot.position.r, "phi": spot.position.phi, "unit": "c/px", "unknown": int(spot.unknown)}
         own |= {"predicted_error": spot.predicted_error}
         for direction, value, (low, high) in spot.directions:
-            yield own | {"direction": direction, "value": value, "low": low, "high": high}
+            yield known | own | {"direction": direction, "value": value, "low": low, "high": high}
     for curve in found.curves:
-        own = known | {"quantity": "MTF", "frequency_c_px": curve.frequency, "frequency_lp_mm": curve.lp_mm}
+        own = {"quantity": "MTF", "frequency_c_px": curve.frequency, "frequency_lp_mm": curve.lp_mm}
         for direction, values in (("tangential", curve.tangential), ("sagittal", curve.sagittal)):
             for r, value in zip(found.radii, values, strict=True):
-                yield own | {"direction": direction, "r": r, "value": value}
-    yield from _centring_rows(found.centring, known)
-
-
-def _centring_rows(found: Centring, known: _Row) -> Iterator[_Row]:
-    """The verdict as 0 or 1, and both signs of a fault with two standard errors; `phi` is their direction."""
-    decentred = int(found.verdict == "decentred")
-    yield known | {"quantity": "decentred", "value": decentred, "unknown": int(found.verdict == "unknown")}
-    if (softer := found.softer) is not None:
-        value, low, high = (math.exp(softer.amount + k * softer.error) for k in (0.0, -2.0, 2.0))
-        yield known | {"quantity": "width of blur, softer side over opposite side", "unit": "ratio"} | {
-            "r": EDGE_R, "phi": softer.direction, "value": value, "low": low, "high": high
-        }  # fmt: skip
-    if (coma := found.coma) is not None:
-        value, low, high = (max(coma.amount + k * coma.error, 0.0) for k in (0.0, -2.0, 2.0))
-        yield known | {"quantity": "coma in the middle of the picture", "unit": "cubed widths of blur"} | {
-            "r": 0.0, "phi": coma.direction, "value": value, "low": low, "high": high
-        }  # fmt: skip
+                yield known | own | {"direction": direction, "r": r, "value": value}
+    centring, errors = found.centring, (0.0, -2.0, 2.0)
+    own = {"value": int(centring.verdict == "decentred"), "unknown": int(centring.verdict == "unknown")}
+    yield known | {"quantity": "decentred"} | own
+    if (softer := centring.softer) is not None:
+        own = {"quantity": "width of blur, softer side over opposite side", "unit": "ratio", "r": EDGE_R}
+        value, low, high = (math.exp(softer.amount + k * softer.error) for k in errors)
+        yield known | own | {"phi": softer.direction, "value": value, "low": low, "high": high}
+    if (coma := centring.coma) is not None:
+        own = {"quantity": "coma in the middle of the picture", "unit": "cubed widths of blur", "r": 0.0}
+        value, low, high = (max(coma.amount + k * coma.error, 0.0) for k in errors)
+        yield known | own | {"phi": coma.direction, "value": value, "low": low, "high": high}

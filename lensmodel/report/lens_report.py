@@ -9,20 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import places_of
 from lensmodel.core.types import (
-    CENTER_ZONE_R,
-    CORNER_ZONE_R,
     ZONES,
     Channel,
     FieldPosition,
@@ -35,7 +32,7 @@ from lensmodel.core.types import (
 )
 from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.quality import crossing, mtf50_from_kernel, mtf_from_kernel
-from lensmodel.report.centring import Centring, centring, direction_in_words
+from lensmodel.report.centring import Centring, centring
 
 # Width over height of a 35 mm frame; a profile does not say how wide its photos were
 DEFAULT_ASPECT: Final = 1.5
@@ -53,7 +50,6 @@ _FREQUENCIES: Final = (0.05, 0.1, 0.15, 0.2)
 # Half-diagonals (chosen: nothing is asked in the very corner, which no sample reaches)
 RADII: Final = tuple(float(r) for r in np.linspace(0.0, 0.95, 11).round(4))
 _ROUND: Final = 1.05  # of the hull of measured places, which a figure may lie beyond (chosen)
-_RING: Final = 2  # places in each quarter of a ring whose mean is its value (chosen: for time)
 # Shares of the centre's MTF50 above which a place is called as sharp, nearly as sharp, and clearly softer
 # (chosen: a fifth less is hardly seen in a print, half as much at a glance)
 _EVEN: Final = 0.95
@@ -79,6 +75,7 @@ _ERRORS: Final = 2.0
 _MEASURED: Final = 0.15
 _RINGS: Final = (np.arange(8) + 0.5) / 16.0  # middles of the rings of frequency whose error an answer says
 _SCALE: Final = np.linspace(0.0, 1.0, 513)  # cycles/pixel
+_TURNS: Final = (0.0, math.pi / 2.0)  # from u, to what is tangential and sagittal
 Range: TypeAlias = tuple[float, float]
 """Between what MTF50 is expected, cycles/pixel."""
 
@@ -112,7 +109,7 @@ class SensorGeometry:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Contrast at one frequency over the radii of a report, mean over the angles that lie on the picture.
+    """Contrast at one frequency over the radii of a report, mean over the ways to the four corners.
 
     `lp_mm` is the frequency in line pairs per millimetre, where the pixel pitch is known.
     """
@@ -132,7 +129,7 @@ class Curve:
 class Spot:
     """What the lens makes of a point at one place: MTF50, at most the Nyquist frequency, and the kernel."""
 
-    place: str
+    place: str  # as "the upper left corner"; empty on a map
     position: FieldPosition
     tangential: float  # the Nyquist frequency means at least that
     sagittal: float
@@ -148,15 +145,15 @@ class Spot:
         return (self.tangential + self.sagittal) / 2.0
 
     @property
-    def side(self) -> str:
-        """The place without its article and the word corner: "upper left"."""
-        return self.place.removeprefix("the ").removesuffix(" corner")
-
-    @property
     def mean_range(self) -> Range:
         """Between what the mean is expected."""
         (t_low, t_high), (s_low, s_high) = self.tangential_range, self.sagittal_range
         return (t_low + s_low) / 2.0, (t_high + s_high) / 2.0
+
+    @property
+    def side(self) -> str:
+        """The place without its article and the word corner: "upper left"."""
+        return self.place.removeprefix("the ").removesuffix(" corner")
 
     @property
     def directions(self) -> tuple[tuple[str, float, Range], ...]:
@@ -167,9 +164,8 @@ class Spot:
     @property
     def words(self) -> str:
         """Both figures with their ranges, never one of the two."""
-        words = SensorGeometry().words
-        tangential = words(self.tangential, between=self.tangential_range)
-        return f"T {tangential}, S {words(self.sagittal, between=self.sagittal_range)}"
+        figures = [SensorGeometry().words(value, between=between) for _, value, between in self.directions]
+        return "T {}, S {}".format(*figures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,10 +236,10 @@ class LensReport:
     @property
     def facts(self) -> str:
         """What it rests on, in words."""
-        parts = [_counted(self.photos, "photo"), f"blur measured at {_counted(self.places, 'place')}"]
+        facts = f"{_counted(self.photos, 'photo')}, blur measured at {_counted(self.places, 'place')}"
         if (pitch := self.sensor.pixel_pitch_um) is not None:
-            parts.append(f"pixels of {pitch:.2f} micrometres, Nyquist frequency {500.0 / pitch:.0f} lp/mm")
-        return ", ".join(parts)
+            facts += f", pixels of {pitch:.2f} micrometres, Nyquist frequency {500.0 / pitch:.0f} lp/mm"
+        return facts
 
     @property
     def advice(self) -> str:
@@ -323,73 +319,72 @@ def lens_report(
     """
     aspect = filled_aspect(model) if aspect is None else aspect
     cols = max(3, round(rows * aspect))
-    center = FieldPosition(0.0, 0.0)
-    named = [(place_in_words(at), at) for at in (*grid(rows, cols, aspect), center, *corner_places(aspect))]
-    named += [(f"the {direction_in_words(at.phi)}", at) for at in side_places(aspect)]
-    outside = _outside_chart(model, [at for _, at in named])
-    measured = all(sample.measured for sample in model.samples)
-    pitch = _shared(sample.pixel_pitch_um for sample in model.samples)
+    mapped = [("", at) for at in grid(rows, cols, aspect)]
+    named = marked_places(aspect).items()
     numbers = _chosen(model) if apertures is None else apertures
     wanted = [LensSettings(aperture=n) for n in numbers] or [LensSettings()]
     questions = [settings.with_channel(channel) for settings in wanted for channel in channels]
+    pitch = _shared(sample.pixel_pitch_um for sample in model.samples)
+    frequencies = _frequencies(pitch)
     tested = []
     for settings in questions:
-        spots = [
-            _spot(words, at, model.query(at, settings, size), outside=bool(beyond), measured=measured)
-            for (words, at), beyond in zip(named, outside, strict=True)
-        ]
+        spots = _spots(model, settings, [*mapped, *named], size)
         tested.append(
             ApertureReport(
                 settings=settings,
                 aspect=aspect,
                 rows=rows,
                 cols=cols,
-                map=tuple(replace(spot, kernel=()) for spot in spots[: rows * cols]),
+                map=tuple(replace(spot, kernel=()) for spot in spots[: len(mapped)]),
                 radii=RADII,
-                curves=_curves(model, settings, aspect, size, _frequencies(pitch)),
-                spots=tuple(spots[rows * cols : -4]),
+                curves=_curves(model, settings, aspect, size, frequencies),
+                spots=tuple(spots[len(mapped) : -4]),
                 sides=tuple(spots[-4:]),
                 centring=centring(model, settings),
             )
         )
         on_step(len(tested), len(questions))
-    half = _shared(s.half_diagonal_px for s in model.samples)
+    half = _shared(sample.half_diagonal_px for sample in model.samples)
     if height_px is None and half is not None:
-        height_px = round(2.0 * half / math.hypot(max(aspect, 1.0 / aspect), 1.0))
+        height_px = round(2.0 * half * min(half_sides(aspect)))
     return LensReport(
         name=name,
-        verdict=verdict(tested[0], _best(tested)),
-        photos=len({s.photo for s in model.samples}),
+        verdict=_verdict(tested),
+        photos=len({sample.photo for sample in model.samples}),
         places=places_of(model.samples),
         sensor=SensorGeometry(pitch, height_px),
         tested=tuple(tested),
         details=dict(details or {}),
-        measured=measured,
+        measured=_measured(model),
     )
 
 
-def _outside_chart(model: LensModel, places: Sequence[FieldPosition]) -> NDArray[np.bool_]:
-    """Whether places lie beyond the outermost samples of a lens that only a chart or a target tells of.
+def _measured(model: LensModel) -> bool:
+    return all(sample.measured for sample in model.samples)
 
-    A regression extrapolates there; corners beyond the outermost square came out softer by 38 to 47 %.
+
+def _spots(
+    model: LensModel, settings: LensSettings, named: Sequence[tuple[str, FieldPosition]], size: int
+) -> list[Spot]:
+    """What a model knows of named places.
+
+    Beyond the outermost samples of a chart or a target the regression extrapolates: corners there came out
+    softer by 38 to 47 %.
     """
-    own = np.array([sample.position.xy for sample in model.samples])
-    try:
-        hull = None if model.weights else Delaunay(_ROUND * own)
-    except QhullError:  # too few samples, or all on a line
-        hull = None
-    if hull is None:
-        return np.zeros(len(places), dtype=np.bool_)
-    return np.asarray(hull.find_simplex(np.array([place.xy for place in places])) < 0)
-
-
-def _spot(words: str, at: FieldPosition, answer: PsfAnswer, *, outside: bool, measured: bool) -> Spot:
-    """What an answer says of its place."""
-    error = float(answer.predicted_error)
-    (t, t_range), (s, s_range) = (_mtf50(answer, at.phi + turn, measured) for turn in (0.0, math.pi / 2.0))
-    unknown = bool(answer.extrapolated or outside or not (measured or error < UNKNOWN))
-    kernel = tuple(tuple(row) for row in answer.kernel.round(7).tolist())
-    return Spot(words, at, t, s, t_range, s_range, error, unknown, kernel)
+    measured, outside = _measured(model), np.zeros(len(named), dtype=np.bool_)
+    if not model.weights:
+        with suppress(QhullError):  # too few samples, or all on a line
+            hull = Delaunay([_ROUND * np.array(sample.position.xy) for sample in model.samples])
+            outside = hull.find_simplex([at.xy for _, at in named]) < 0
+    spots = []
+    for (words, at), beyond in zip(named, outside, strict=True):
+        answer = model.query(at, settings, size)
+        error = float(answer.predicted_error)
+        (t, t_range), (s, s_range) = (_mtf50(answer, at.phi + turn, measured) for turn in _TURNS)
+        unknown = bool(answer.extrapolated or beyond or not (measured or error < UNKNOWN))
+        kernel = tuple(tuple(row) for row in answer.kernel.round(7).tolist())
+        spots.append(Spot(words, at, t, s, t_range, s_range, error, unknown, kernel))
+    return spots
 
 
 def _mtf50(answer: PsfAnswer, angle: float, measured: bool) -> tuple[float, Range]:
@@ -401,12 +396,12 @@ def _mtf50(answer: PsfAnswer, angle: float, measured: bool) -> tuple[float, Rang
     if answer.ring_error is None or answer.answered_by != "network":
         # between and beyond the places of a chart less is known than at them
         share = max(answer.predicted_error, _MEASURED if measured else 0.0)
-        between = max(value * (1.0 - share), 0.0), value * (1.0 + share)
+        low, high = max(value * (1.0 - share), 0.0), value * (1.0 + share)
     else:
         contrast = mtf_from_kernel(answer.kernel, angle, _SCALE)
         error = _ERRORS * np.interp(_SCALE, _RINGS, answer.ring_error)
-        between = crossing(_SCALE, contrast - error, 0.5), crossing(_SCALE, contrast + error, 0.5)
-    return min(value, NYQUIST), (min(between[0], NYQUIST), min(between[1], NYQUIST))
+        low, high = crossing(_SCALE, contrast - error, 0.5), crossing(_SCALE, contrast + error, 0.5)
+    return min(value, NYQUIST), (min(low, NYQUIST), min(high, NYQUIST))
 
 
 def _curves(
@@ -416,27 +411,28 @@ def _curves(
     size: int,
     wanted: Sequence[tuple[float, float | None]],
 ) -> tuple[Curve, ...]:
-    """Contrast at wanted frequencies over the radius, mean over the places of a radius."""
+    """Contrast at wanted frequencies from the centre to the corners, mean of the four."""
     frequencies = [f for f, _ in wanted]
-    rings = [ring(r, _RING, aspect) for r in RADII]
-    kernels = iter(model.kernels([place for places in rings for place in places], settings, size))
-    out = np.empty((len(wanted), 2, len(rings)))  # frequency, tangential and sagittal, radius
-    for column, places in enumerate(rings):
-        own = [(next(kernels), place.phi) for place in places]
-        for row, turn in enumerate((0.0, math.pi / 2.0)):
-            contrasts = [mtf_from_kernel(kernel, phi + turn, frequencies) for kernel, phi in own]
-            out[:, row, column] = np.mean(contrasts, axis=0)
-        if len(places) == 1:
-            out[:, :, column] = out[:, :, column].mean(axis=1, keepdims=True)  # u has no direction there
+    places = [FieldPosition(r, phi) for r in RADII for phi in corner_angles(aspect)]
+    contrasts = [
+        [mtf_from_kernel(kernel, at.phi + turn, frequencies) for turn in _TURNS]
+        for kernel, at in zip(model.kernels(places, settings, size), places, strict=True)
+    ]
+    mean = np.reshape(contrasts, (len(RADII), 4, 2, len(wanted))).mean(axis=1)
+    mean[0] = mean[0].mean(axis=0)  # u has no direction in the centre
     return tuple(
-        Curve(f, lp, tuple(t), tuple(s)) for (f, lp), (t, s) in zip(wanted, out.tolist(), strict=True)
+        Curve(f, lp, *map(tuple, both))
+        for (f, lp), both in zip(wanted, mean.transpose(2, 1, 0).tolist(), strict=True)
     )
 
 
-def verdict(found: ApertureReport, best: float | None = None) -> str:
-    """Say what a photographer wants to know: centre, worst corner, centring, best aperture."""
-    words = [sharpness(found)]
-    if best is not None and best != found.settings.aperture:
+def _verdict(tested: Sequence[ApertureReport]) -> str:
+    """Say what a photographer wants to know: centre, worst corner, best aperture, centring."""
+    found, words = tested[0], [sharpness(tested[0])]
+    green = [one for one in tested if one.settings.channel == "g"]
+    means = {one.settings.aperture: float(np.mean([spot.mean for spot in one.map])) for one in green}
+    best = max(means, key=lambda n: (means[n], -(n or 0.0)), default=None)
+    if len(means) > 1 and best != found.settings.aperture:
         words.append(f"It is sharpest over the whole picture at f/{best:g}.")
     side, tails = found.centring.side, "points in the middle of the picture have tails"
     words.append(
@@ -485,13 +481,6 @@ def _chosen(model: LensModel) -> list[float]:
     return sorted({*known[:1], *known[-1:], *inner})
 
 
-def _best(tested: Sequence[ApertureReport]) -> float | None:
-    """Aperture with the largest mean MTF50 over the picture; None where one was tested."""
-    green = [one for one in tested if one.settings.channel == "g"]
-    means = {one.settings.aperture: float(np.mean([spot.mean for spot in one.map])) for one in green}
-    return max(means, key=lambda n: (means[n], -(n or 0.0))) if len(means) > 1 else None
-
-
 def _shared(values: Iterable[float | None]) -> float | None:
     known = set(values)
     return next(iter(known)) if len(known) == 1 else None
@@ -537,55 +526,35 @@ def compare(first: LensReport, second: LensReport) -> str:
 # --- places of the field -------------------------------------------------------------------------
 
 
-def place_in_words(position: FieldPosition) -> str:
-    """Name a place so that somebody can put it into the viewfinder: "the upper left corner"."""
-    if position.r < CENTER_ZONE_R:
-        return "the centre"
-    side = direction_in_words(position.phi)
-    if position.r <= CORNER_ZONE_R:
-        return f"the {side}"
-    return f"the {side} {'corner' if ' ' in side else 'edge'}"
-
-
 def half_sides(aspect: float) -> tuple[float, float]:
     """Half width and half height of a frame in half diagonals."""
-    if not 0.2 <= aspect <= 5.0:
-        raise InvalidInputError(f"width over height must lie in 0.2..5, got {aspect}")
     diagonal = math.hypot(aspect, 1.0)
     return aspect / diagonal, 1.0 / diagonal
 
 
 def grid(rows: int, cols: int, aspect: float) -> tuple[FieldPosition, ...]:
     """Centres of rows x cols equal cells of the picture, row by row from the top left."""
-    if not (1 <= rows <= 100 and 1 <= cols <= 100):
-        raise InvalidInputError(f"a grid has 1..100 rows and columns, got {rows} x {cols}")
-    r, phi = field_grid(rows, cols, aspect=aspect)
-    return tuple(FieldPosition(float(a), float(b)) for a, b in zip(r.ravel(), phi.ravel(), strict=True))
+    places = np.stack(field_grid(rows, cols, aspect=aspect), axis=2).reshape(-1, 2)
+    return tuple(FieldPosition(r, phi) for r, phi in places.tolist())
 
 
-def ring(r: float, count: int, aspect: float) -> tuple[FieldPosition, ...]:
-    """Places at one radius that lie on the picture, symmetric about both of its axes.
-
-    Angles are drawn evenly from the arcs that the frame cuts from the circle; one place at the centre.
-    """
-    if r == 0.0:
-        return (FieldPosition(0.0, 0.0),)
-    width, height = half_sides(aspect)
-    low = math.acos(min(width / r, 1.0))
-    high = math.asin(min(height / r, 1.0))
-    quarter = [low + (high - low) * (k + 0.5) / count for k in range(count)]
-    angles = [s * (a if side > 0 else math.pi - a) for s in (1, -1) for side in (1, -1) for a in quarter]
-    return tuple(FieldPosition(r, a) for a in angles)
-
-
-def corner_places(aspect: float) -> tuple[FieldPosition, ...]:
-    """The four corners, upper left first, as far out as samples reach."""
+def corner_angles(aspect: float) -> tuple[float, float, float, float]:
+    """Upper left, upper right, lower left, lower right."""
     angle = math.atan(1.0 / aspect)
-    return tuple(FieldPosition(0.9, phi) for phi in (math.pi - angle, angle, angle - math.pi, -angle))
+    return math.pi - angle, angle, angle - math.pi, -angle
 
 
-def side_places(aspect: float) -> tuple[FieldPosition, ...]:
-    """Left, right, top and bottom, four fifths of the way to the edge."""
-    width, height = half_sides(aspect)
-    sides = ((width, math.pi), (width, 0.0), (height, math.pi / 2), (height, -math.pi / 2))
-    return tuple(FieldPosition(0.8 * half, phi) for half, phi in sides)
+def marked_places(aspect: float) -> dict[str, FieldPosition]:
+    """The centre, the corners as far out as samples reach, and the sides at four fifths, by their names."""
+    width, height = (0.8 * half for half in half_sides(aspect))
+    corners = zip(
+        ("upper left", "upper right", "lower left", "lower right"), corner_angles(aspect), strict=True
+    )
+    return {
+        "the centre": FieldPosition(0.0, 0.0),
+        **{f"the {side} corner": FieldPosition(0.9, phi) for side, phi in corners},
+        "the left": FieldPosition(width, math.pi),
+        "the right": FieldPosition(width, 0.0),
+        "the top": FieldPosition(height, math.pi / 2.0),
+        "the bottom": FieldPosition(height, -math.pi / 2.0),
+    }

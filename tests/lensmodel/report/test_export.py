@@ -39,13 +39,13 @@ def arrow() -> PsfGrid:
     """One kernel with its light above and to the right: a flipped axis shows."""
     kernel = np.zeros((1, 5, 5), dtype=np.float32)
     kernel[0, 0, 2], kernel[0, 2, 4] = 0.75, 0.25
-    return PsfGrid(kernel, (FieldPosition(0.5, 1.0),), 1, 1, SETTINGS, (0.1,))
+    return PsfGrid(kernel, *np.array([[0.5], [1.0], [0.1]]), 1, 1, SETTINGS)
 
 
 def test_a_grid_asks_the_model_at_each_place(model: LensModel, psfs: PsfGrid) -> None:
     assert psfs.kernels.shape == (6, 15, 15)
-    for place, kernel in zip(psfs.positions, psfs.kernels, strict=True):
-        assert kernel == pytest.approx(model.query(place, SETTINGS, 15).kernel, abs=1e-7)
+    for r, phi, kernel in zip(psfs.r, psfs.phi, psfs.kernels, strict=True):
+        assert kernel == pytest.approx(model.query(FieldPosition(r, phi), SETTINGS, 15).kernel, abs=1e-7)
 
 
 def test_fits_is_a_cube_stored_from_the_bottom_with_a_table_of_places(psfs: PsfGrid, tmp_path: Path) -> None:
@@ -59,8 +59,8 @@ def test_fits_is_a_cube_stored_from_the_bottom_with_a_table_of_places(psfs: PsfG
         assert header["BITPIX"] == -32
         assert header["ROWORDER"] == "BOTTOM-UP"
         assert header["FNUMBER"] == 2.0
-        assert table["R"].tolist() == [p.r for p in psfs.positions]
-        assert table["PHI"].tolist() == [p.phi for p in psfs.positions]
+        assert table["R"].tolist() == psfs.r.tolist()
+        assert table["PHI"].tolist() == psfs.phi.tolist()
 
 
 @pytest.mark.parametrize("form", ["fits", "json"])
@@ -93,8 +93,8 @@ def test_npz_holds_kernels_and_places_without_pickle(psfs: PsfGrid, tmp_path: Pa
 
     with np.load(tmp_path / "psf.npz", allow_pickle=False) as stored:
         assert np.array_equal(stored["psf"], psfs.kernels)
-        assert stored["r"].tolist() == [p.r for p in psfs.positions]
-        assert stored["phi"].tolist() == [p.phi for p in psfs.positions]
+        assert stored["r"].tolist() == psfs.r.tolist()
+        assert stored["phi"].tolist() == psfs.phi.tolist()
         assert stored["shape"].tolist() == [2, 3]
         assert set(stored["aperture"]) == {2.0}
 
@@ -113,7 +113,7 @@ def test_a_single_place_is_that_kernel(model: LensModel) -> None:
 
     one = psf_grid(model, SETTINGS, size=15, at=place)
 
-    assert (one.rows, one.cols, one.positions) == (1, 1, (place,))
+    assert (one.rows, one.cols, *one.r, *one.phi) == (1, 1, place.r, place.phi)
     assert np.hypot(*centroid(one.kernels[0].astype(np.float64))) < 2e-3
 
 

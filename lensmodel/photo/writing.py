@@ -274,12 +274,11 @@ def write_bayer_dng(
     color_matrix: ArrayLike = XYZ_TO_SRGB,
     as_shot_neutral: Sequence[float] = (1.0, 1.0, 1.0),
     metadata: PhotoMetadata = UNKNOWN,
-    description: str = "",
     baseline_exposure: float | None = None,
 ) -> None:
     """Write a raw mosaic as an uncompressed DNG; the file appears whole or not at all."""
     tags = {
-        **written_tags(metadata, description),
+        **written_tags(metadata),
         **dng_tags(metadata, color_matrix, as_shot_neutral, baseline_exposure),
         262: shorts(32803),  # PhotometricInterpretation: a colour filter array (TIFF/EP)
         33421: shorts(2, 2),  # CFARepeatPatternDim

@@ -49,18 +49,6 @@ def save(tmp_path: Path, kind: str, pixels: NDArray[np.generic], **options: obje
 # --- RAW ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("level", [0.1, 0.5, 0.9])
-def test_raw_numbers_become_linear_light_with_saturation_at_one(tmp_path: Path, level: float) -> None:
-    mosaic = raw_numbers(np.full((64, 64), level))
-    mosaic[:, ::16] += 1  # a row of equal numbers would be an empty one
-    mosaic[20:44, 20:44] = WHITE
-    developed = shot(tmp_path, mosaic)
-
-    assert developed.planes.dtype == np.float32
-    assert developed.planes[:, 4, 8] == pytest.approx(level, abs=1e-4)
-    assert (developed.planes[:, 32, 32] == 1.0).all()
-
-
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_developed_planes_say_which_pixels_the_sensor_measured(tmp_path: Path, pattern: str) -> None:
     mosaic = raw_numbers(textured(64, 96))

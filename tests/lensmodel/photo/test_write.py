@@ -32,7 +32,6 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, matrix3, srgb_to_linear
 from lensmodel.photo.metadata import gps_directory, xmp_packet
 from lensmodel.photo.writing import (
-    BAYER_PATTERNS,
     XYZ_TO_SRGB,
     Opcode,
     demosaiced,
@@ -235,45 +234,32 @@ def test_a_linear_dng_asks_for_the_baseline_exposure_of_the_dng_it_came_from(
 
 @pytest.mark.parametrize("output", FORMATS)
 def test_our_own_reader_finds_the_safe_metadata_again(tmp_path: Path, output: photo.OutputFormat) -> None:
-    path = tmp_path / "x"
-    photo.write_image(path, planes(), PLAIN, format=output, description="corrected")
-    seen = photo.inspect(path).metadata
+    path, again, turned = tmp_path / "x", tmp_path / "again", orientation_of(PLAIN, 6)
+    for target in (path, again):
+        photo.write_image(target, planes(), turned, format=output, description="corrected")
+    seen, upright = photo.inspect(path), output.startswith("png")
 
-    assert seen == METADATA.without_serials()
+    assert seen.metadata == replace(METADATA.without_serials(), orientation=1 if upright else 6)
+    assert (seen.width, seen.height) == ((48, 64) if upright else (64, 48))
     assert not [word for word in (b"BODY1", b"LENS1", b"GPS") if word in path.read_bytes()]
-    photo.write_image(tmp_path / "again", planes(), PLAIN, format=output, description="corrected")
-    assert (tmp_path / "again").read_bytes() == path.read_bytes()
-
-
-@pytest.fixture(scope="module")
-def read_by_exiftool(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
-    """What it says of a file of each format: to start it takes longer than to read one more."""
-    program = shutil.which("exiftool")
-    if program is None:
-        pytest.skip("the program exiftool is not installed")
-    folder = tmp_path_factory.mktemp("exiftool")
-    for output in FORMATS:
-        turned = orientation_of(PLAIN, 6)
-        photo.write_image(folder / output, planes(), turned, format=output, description="corrected")
-    files = [str(folder / output) for output in FORMATS]
-    run = subprocess.run([program, "-j", "-n", *files], capture_output=True, check=True, text=True)
-    return {Path(read["SourceFile"]).name: read for read in json.loads(run.stdout)}
+    assert again.read_bytes() == path.read_bytes()
 
 
 @pytest.mark.tools
-@pytest.mark.parametrize("output", FORMATS)
-def test_exiftool_finds_no_fault_and_the_same_values(
-    read_by_exiftool: dict[str, dict[str, Any]], output: photo.OutputFormat
-) -> None:
-    read = read_by_exiftool[output]
+def test_exiftool_finds_no_fault_and_the_same_values(tmp_path: Path) -> None:
+    program = shutil.which("exiftool")
+    if program is None:
+        pytest.skip("the program exiftool is not installed")
+    turned = orientation_of(PLAIN, 6)
+    for output in FORMATS:
+        photo.write_image(tmp_path / output, planes(), turned, format=output, description="corrected")
+    run = subprocess.run([program, "-j", "-n", tmp_path], capture_output=True, check=True, text=True)
 
-    assert "Error" not in read
-    assert "Warning" not in read
-    assert (read["FNumber"], read["FocalLength"], read["ISO"]) == (2.8, 24, 400)
-    assert read["LensModel"] == "EF24mm f/1.4L"
-    assert read["DateTimeOriginal"] == "2020:02:03 04:05:06"
-    assert read["Orientation"] == (1 if output.startswith("png") else 6)
-    assert "SerialNumber" not in read
+    for read in json.loads(run.stdout):
+        assert not {"Error", "Warning", "SerialNumber"} & read.keys()
+        assert (read["FNumber"], read["FocalLength"], read["ISO"]) == (2.8, 24, 400)
+        assert (read["LensModel"], read["DateTimeOriginal"]) == ("EF24mm f/1.4L", "2020:02:03 04:05:06")
+        assert read["Orientation"] == (1 if read["FileName"].startswith("png") else 6)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -287,17 +273,6 @@ def test_pngs_are_written_upright(tmp_path: Path, orientation: int) -> None:
     expected = np.asarray(ImageOps.exif_transpose(turned))
 
     assert (np.asarray(Image.open(tmp_path / "x.png")) == expected).all()
-
-
-@pytest.mark.parametrize("output", ["tiff16", "jpeg", "dng"])
-def test_other_formats_keep_the_sensor_orientation_and_say_how_to_turn(
-    tmp_path: Path, output: photo.OutputFormat
-) -> None:
-    photo.write_image(tmp_path / "x", planes(), orientation_of(PLAIN, 6), format=output)
-    info = photo.inspect(tmp_path / "x")
-
-    assert (info.width, info.height) == (64, 48)
-    assert info.metadata.orientation == 6
 
 
 def test_jpeg_keeps_the_colour_of_single_pixels(tmp_path: Path) -> None:
@@ -390,24 +365,13 @@ SHOT = replace(
     focus_m=3.25,
     pixel_pitch_um=4.5,
     orientation=6,
+    artist="Example",
+    copyright="(c) Example",
 )
 
 
 def mosaic(height: int = 64, width: int = 96) -> NDArray[np.uint16]:
     return np.random.default_rng(0).integers(400, 15873, (height, width), dtype=np.uint16)
-
-
-@pytest.mark.parametrize("pattern", BAYER_PATTERNS)
-def test_raw_numbers_and_pattern_come_back(tmp_path: Path, pattern: str) -> None:
-    written = mosaic()
-    write_bayer_dng(tmp_path / "a.dng", written, black=512, white=15872, pattern=pattern, metadata=SHOT)
-
-    with rawpy.imread(str(tmp_path / "a.dng")) as raw:
-        np.testing.assert_array_equal(raw.raw_image, written)
-        letters = "".join(raw.color_desc.decode()[i] for i in raw.raw_pattern.ravel())
-        assert letters == pattern
-        assert raw.black_level_per_channel == [512] * 4
-        assert raw.white_level == 15872
 
 
 def test_colours_come_out_as_the_matrix_and_the_neutral_say(tmp_path: Path) -> None:
@@ -429,7 +393,7 @@ def test_colours_come_out_as_the_matrix_and_the_neutral_say(tmp_path: Path) -> N
 def test_every_tag_comes_back_and_unknown_ones_are_left_out(tmp_path: Path) -> None:
     def tags_of(metadata: photo.PhotoMetadata) -> dict[str, Any]:
         path = tmp_path / "tags.dng"
-        write_bayer_dng(path, mosaic(), black=512, white=15872, metadata=metadata, description="a test")
+        write_bayer_dng(path, mosaic(), black=512, white=15872, metadata=metadata)
         with path.open("rb") as file:
             return exifread.process_file(file)
 
@@ -437,7 +401,8 @@ def test_every_tag_comes_back_and_unknown_ones_are_left_out(tmp_path: Path) -> N
     wanted = {
         "Image Make": "Canon",
         "Image Model": "EOS 6D",
-        "Image ImageDescription": "a test",
+        "Image Artist": "Example",
+        "Image Copyright": "(c) Example",
         "Image DateTime": "2020:02:03 04:05:06",
         "Image Orientation": "Rotated 90 CW",
         "EXIF FNumber": "14/5",
@@ -460,20 +425,6 @@ def test_every_tag_comes_back_and_unknown_ones_are_left_out(tmp_path: Path) -> N
     assert not {"LensModel", "LensSerialNumber", "FNumber", "FocalLength", "ISOSpeedRatings"} & {
         name.removeprefix("EXIF ") for name in bare
     }
-
-
-@pytest.mark.parametrize(
-    ("maker", "model", "unique"),
-    [("Maker", "Body 1", "Maker Body 1"), ("Maker", "Maker Body 1", "Maker Body 1"), ("", "Body", "Body")],
-)
-def test_camera_is_named_with_its_maker_once(tmp_path: Path, maker: str, model: str, unique: str) -> None:
-    path = tmp_path / "n.dng"
-    metadata = photo.PhotoMetadata(camera_maker=maker, camera_model=model)
-
-    write_bayer_dng(path, mosaic(), black=256, white=15872, metadata=metadata)
-
-    assert unique.encode() + b"\0" in path.read_bytes()
-    assert b"Maker Maker" not in path.read_bytes()
 
 
 def test_files_are_as_private_as_their_writer_asks(tmp_path: Path) -> None:
@@ -507,14 +458,9 @@ def corrected(source: Path, target: Path, output: photo.OutputFormat, **options:
 
 @pytest.mark.parametrize("output", [*FORMATS, "tiff32"])
 def test_copyright_and_artist_are_kept(output: photo.OutputFormat, tmp_path: Path) -> None:
-    result = corrected(REPORTS / "copyright.jpg", tmp_path / "x", output)
-    said = photo.inspect(result).metadata
+    said = photo.inspect(corrected(REPORTS / "copyright.jpg", tmp_path / "x", output)).metadata
 
     assert (said.copyright, said.artist) == ("(c) 2024 Example", "Example")
-    if not output.startswith("png"):
-        with result.open("rb") as file:
-            tags = exifread.process_file(file)
-        assert (str(tags["Image Copyright"]), str(tags["Image Artist"])) == ("(c) 2024 Example", "Example")
 
 
 @pytest.mark.parametrize("rating", [-1, 0, 4])

@@ -59,15 +59,6 @@ def to_octant_image(octant: int, image: NDArray[Any]) -> NDArray[Any]:
     return np.swapaxes(image[..., ::-1, ::-1], -1, -2) if octant & 4 else image
 
 
-def from_octant_image(octant: int, image: NDArray[Any]) -> NDArray[Any]:
-    """Turn images of shape (..., n, n) back from the frame of an octant."""
-    if octant & 4:
-        image = np.swapaxes(image[..., ::-1, ::-1], -1, -2)
-    if octant & 2:
-        image = image[..., ::-1, :]
-    return image[..., ::-1] if octant & 1 else image
-
-
 def relative_octant(query: NDArray[np.int64], sample: NDArray[np.int64]) -> NDArray[np.int64]:
     """Symmetry that leads from the frame of a sample's octant to that of the query's, 0..7."""
     return _RELATIVE[query, sample]
@@ -77,6 +68,11 @@ def relative_octant(query: NDArray[np.int64], sample: NDArray[np.int64]) -> NDAr
 _MATRICES: Final = to_octant_place(np.arange(OCTANTS)[:, None], np.eye(2)).mT
 _PRODUCTS: Final = _MATRICES[:, None] @ _MATRICES.mT[None]
 _RELATIVE: Final = (_PRODUCTS[:, :, None] == _MATRICES).all(axis=(-1, -2)).argmax(axis=-1)
+
+
+def from_octant_image(octant: int, image: NDArray[Any]) -> NDArray[Any]:
+    """Turn images of shape (..., n, n) back from the frame of an octant."""
+    return to_octant_image(int(_RELATIVE[0, octant]), image)
 
 
 WINDOW: Final = 128  # pixels: holds several times the widest kernel, and little of the field (chosen)

@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 from PIL.JpegImagePlugin import JpegImageFile
 
@@ -76,7 +76,7 @@ def check_size(width: int, height: int, file_bytes: int, limits: Limits) -> None
 
 # --- which kind --------------------------------------------------------------------------------
 
-_KINDS: Final[tuple[tuple[int, bytes, FileKind], ...]] = (
+_KINDS: Final[tuple[tuple[int, bytes, str], ...]] = (
     (0, b"FUJIFILMCCD-RAW", "raw"),
     (0, b"IIU\0", "raw"),  # Panasonic
     (0, b"IIRO", "raw"), (0, b"IIRS", "raw"), (0, b"MMOR", "raw"),  # Olympus
@@ -88,8 +88,7 @@ _KINDS: Final[tuple[tuple[int, bytes, FileKind], ...]] = (
     (0, b"II*\0", "tiff"), (0, b"MM\0*", "tiff"),
     (0, b"\x89PNG\r\n\x1a\n", "png"),
     (0, b"\xff\xd8\xff", "jpeg"),
-)  # fmt: skip
-_REFUSED: Final[tuple[tuple[int, bytes, str], ...]] = (
+    # known, and not read
     (0, b"GIF8", "GIF"), (8, b"WEBP", "WebP"), (0, b"BM", "BMP"), (0, b"8BPS", "Photoshop"),
     (4, b"ftypheic", "HEIC"), (4, b"ftypmif1", "HEIF"), (4, b"ftypavif", "AVIF"),
     (0, b"\xff\x0a", "JPEG XL"), (4, b"JXL ", "JPEG XL"), (4, b"jP  ", "JPEG 2000"),
@@ -104,10 +103,9 @@ def sniff(head: bytes) -> FileKind:
     """Tell the kind of file by its first bytes alone, by which NEF, ARW, PEF and DNG are TIFF too."""
     for at, magic, kind in _KINDS:
         if head.startswith(magic, at):
-            return kind
-    for at, magic, name in _REFUSED:
-        if head.startswith(magic, at):
-            raise UnsupportedFormatError(f"{name} files are not read; {_READABLE}")
+            if kind in _PARSERS:
+                return cast("FileKind", kind)
+            raise UnsupportedFormatError(f"{kind} files are not read; {_READABLE}")
     if not head:
         raise NotAnImageError(f"the file is empty; {_READABLE}")
     raise NotAnImageError(f"the first bytes ({head[:8].hex(' ')}) belong to no photo format; {_READABLE}")

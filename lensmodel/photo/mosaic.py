@@ -156,8 +156,14 @@ class Mosaic:
         """Measure the noise of the sensor in each colour, `white` being 1; `None` for X-Trans."""
         if not self.is_bayer:
             return None
+        sites: dict[int, Plane] = {}  # of the second green as of the first
+        for row, col in np.ndindex(2, 2):
+            colour = int(self.colours[row, col])
+            black = np.float32(self.black[colour])
+            values = self.values[row::2, col::2].astype(np.float32)
+            sites.setdefault(1 if colour == 3 else colour, (values - black) / (np.float32(white) - black))
         step = 1.0 / max(white - min(self.black), 1.0)
-        r, g, b = (estimate_noise(site, step=step) for site in self.sites(white))
+        r, g, b = (estimate_noise(sites[k], step=step) for k in range(3))
         return r, g, b
 
     def bayer_pattern(self) -> BayerPattern | None:
@@ -167,16 +173,6 @@ class Mosaic:
         cell = self.colours[:2, :2]
         (a, b), (c, d) = np.where(cell == 3, 1, cell).tolist()
         return ((a, b), (c, d))
-
-    def sites(self, white: int) -> list[Plane]:
-        """Red, green and blue at half the size, without interpolation; black 0, `white` 1."""
-        planes: dict[int, Plane] = {}
-        for row, col in np.ndindex(2, 2):
-            colour = int(self.colours[row, col])
-            black = np.float32(self.black[colour])
-            values = self.values[row::2, col::2].astype(np.float32)
-            planes.setdefault(1 if colour == 3 else colour, (values - black) / (np.float32(white) - black))
-        return [planes[k] for k in sorted(planes)]
 
 
 # --- defective pixels --------------------------------------------------------------------------

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -16,7 +15,8 @@ from lensmodel import calibrate, correct, photo, simulate
 from lensmodel.core.errors import RawDecodeError, UnsupportedFormatError
 from lensmodel.core.types import LensSettings, Zone
 from lensmodel.photo.mosaic import replace_defects
-from lensmodel.photo.writing import write_bayer_dng
+from lensmodel.photo.tiff import BYTE, shorts, write_strip
+from lensmodel.photo.writing import dng_tags, write_bayer_dng
 
 CAMERA = simulate.SimulatedCamera(height=400, width=600)
 RANGE = CAMERA.white - CAMERA.black
@@ -58,19 +58,16 @@ def write(path: Path, values: NDArray[np.uint16]) -> Path:
 
 
 def write_xtrans(path: Path, values: NDArray[np.uint16]) -> Path:
-    cell = "".join(XTRANS)
-    tags = [
-        (33421, 3, 2, (6, 6), True),
-        (33422, 1, 36, bytes("RGB".index(letter) for letter in cell), True),
-        (50706, 1, 4, b"\1\4\0\0", True),
-        (50708, 2, 5, "X-1", True),
-        (50714, 4, 1, CAMERA.black, True),
-        (50717, 4, 1, CAMERA.white, True),
-        (50721, 10, 9, (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1), True),
-        (50728, 5, 3, (1, 2, 1, 1, 1, 2), True),
-        (272, 2, 4, "X-1", True),
-    ]
-    tifffile.imwrite(path, values, photometric=32803, extratags=tags, metadata=None)
+    tags = {
+        **dng_tags(photo.PhotoMetadata(camera_model="X-1"), np.eye(3), (0.5, 1.0, 0.5), None),
+        262: shorts(32803),
+        33421: shorts(6, 6),
+        33422: (BYTE, bytes("RGB".index(letter) for letter in "".join(XTRANS))),
+        50714: shorts(CAMERA.black),
+        50717: shorts(CAMERA.white),
+    }
+    with path.open("wb") as file:
+        write_strip(file, tags, values)
     return path
 
 

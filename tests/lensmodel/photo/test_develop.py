@@ -14,7 +14,8 @@ from scipy import ndimage
 from lensmodel import photo
 from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
-from lensmodel.photo.writing import write_bayer_dng
+from lensmodel.photo.tiff import shorts, write_strip
+from lensmodel.photo.writing import dng_tags, write_bayer_dng
 
 BLACK, WHITE = 512, 15000
 agree = partial(np.testing.assert_allclose, rtol=0.0, equal_nan=False)
@@ -146,19 +147,10 @@ def test_white_of_a_linear_dng_with_black_levels_is_one(
     planes[:, 10:20, 10:20] = 1.0
     low, high = np.array(black), np.resize(white, 3)
     codes = np.rint(low + np.moveaxis(planes, 0, -1) * (high - low)).astype(np.uint16)
-    tifffile.imwrite(
-        tmp_path / "x.dng",
-        codes,
-        photometric=34892,
-        metadata=None,
-        extratags=[
-            (50706, 1, 4, b"\1\4\0\0", True),
-            (50708, 2, 0, "T-1", True),
-            (50714, 3, 3, black, True),
-            (50717, 3, len(white), white, True),
-            (50721, 10, 9, [n for v in np.eye(3).ravel() for n in (int(v), 1)], True),
-        ],
-    )
+    tags = dng_tags(photo.PhotoMetadata(), np.eye(3), (1.0, 1.0, 1.0), None)
+    levels = {262: shorts(34892), 50714: shorts(*black), 50717: shorts(*white)}
+    with (tmp_path / "x.dng").open("wb") as file:
+        write_strip(file, {**tags, **levels}, codes)
     developed = photo.develop(tmp_path / "x.dng")
 
     agree(developed.planes, planes, atol=2e-4)

@@ -72,40 +72,6 @@ def metadata_of(tmp_path: Path) -> Read:
     return read
 
 
-def test_exif_is_read_in_full(metadata_of: Read) -> None:
-    seen = metadata_of(
-        jpeg_with(
-            {0x010F: "Canon", 0x0110: "EOS 6D", 0x0112: 6},
-            {
-                0x829A: IFDRational(1, 160),
-                0x829D: IFDRational(28, 10),
-                0x8827: 400,
-                0x9003: "2020:02:03 04:05:06",
-                0x9206: IFDRational(15, 10),
-                0x920A: IFDRational(24, 1),
-                0xA431: "123",
-                0xA433: "Canon",
-                0xA434: "EF24mm f/1.4L",
-                0xA435: "00009f8eeb",
-            },
-        )
-    )
-
-    assert seen == photo.PhotoMetadata(
-        camera_maker="Canon",
-        camera_model="EOS 6D",
-        body_serial="123",
-        lens=photo.LensIdentity("Canon", "EF24mm f/1.4L", "00009f8eeb", "exif"),
-        aperture=2.8,
-        focal_mm=24.0,
-        focus_m=1.5,
-        iso=400,
-        exposure_s=1 / 160,
-        taken_at=datetime(2020, 2, 3, 4, 5, 6),  # noqa: DTZ001  the camera's clock has no zone
-        orientation=6,
-    )
-
-
 @pytest.mark.parametrize(
     ("main", "exif", "known"),
     [

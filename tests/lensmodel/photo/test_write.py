@@ -398,6 +398,8 @@ def test_every_tag_comes_back_and_unknown_ones_are_left_out(tmp_path: Path) -> N
             return exifread.process_file(file)
 
     tags = tags_of(SHOT)
+    named = replace(SHOT.lens, model="G?te 24-70mm f/2.8")
+    assert photo.inspect(tmp_path / "tags.dng").metadata == replace(SHOT, lens=named)
     wanted = {
         "Image Make": "Canon",
         "Image Model": "EOS 6D",

@@ -128,23 +128,6 @@ def test_a_tiff_that_could_only_fail_is_refused_before_it_is_stored(
         photo.inspect(tmp_path / "x.tif")
 
 
-def test_chroma_of_several_pixels_is_named_and_not_taken_for_a_file_that_was_cut_off(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "x.tif", PIXELS, photometric="ycbcr", metadata=None)
-    with tifffile.TiffFile(tmp_path / "x.tif", mode="r+") as file:
-        file.pages[0].tags[279].overwrite(PIXELS.size // 2)  # StripByteCounts of 4:2:0
-
-    with pytest.raises(UnsupportedFormatError, match="YCbCr"):
-        photo.inspect(tmp_path / "x.tif")
-
-
-def test_a_quad_bayer_mosaic_is_refused_by_its_pattern_and_nothing_is_printed() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for read in (photo.inspect, photo.develop):
-            with pytest.raises(UnsupportedFormatError, match=r"4 x 4 pixels \(RRGG RRGG GGBB GGBB\)"):
-                read(REPORTS / "quad-bayer.dng")
-
-
 @pytest.mark.parametrize(
     ("rows", "columns", "colours"),
     [(2, 2, "RGRG"), (2, 4, "RGGBGRBG"), (2, 2, "CYGM"), (2, 2, "RWGB"), (8, 2, "RGGBRGGBRGGBRGGB")],

@@ -22,14 +22,14 @@ from lensmodel import measured as measure
 from lensmodel import simulate
 from lensmodel.calibration import joined
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.psf import as_kernel, centred, resized
+from lensmodel.core.psf import as_kernel, centred
 from lensmodel.core.types import Frame, Kernel, LensSettings, NoiseModel, StepHook, ignore_step
 from lensmodel.measured.edges import SlantedEdges, squares_of
 from lensmodel.measured.measurer import Found, Measurer, Prepared, solve
 from lensmodel.measured.pair import AperturePair, diffraction_otf
 from lensmodel.measured.points import Points, find_lights, isolated_lights
 from lensmodel.measured.registration import homography_of, match
-from lensmodel.measured.target import PAPERS, PlacedPage, Target, TargetPage
+from lensmodel.measured.target import PAPERS, Target, TargetPage
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo, PhotoMetadata
@@ -59,18 +59,17 @@ def light_scene(spacing: int, shape: tuple[int, int], rng: np.random.Generator) 
     A point between pixels is the sinc that a point is to whoever sees no finer than pixels. Its lobes are
     negative here and gone behind a lens.
     """
-    height, width = (n + 2 * targets.MARGIN for n in shape)
-    plane = np.zeros((height, width))
-    step_r = np.arange(targets.MARGIN + spacing // 2, height - targets.MARGIN - spacing // 4, spacing)
-    step_c = np.arange(targets.MARGIN + spacing // 2, width - targets.MARGIN - spacing // 4, spacing)
+    plane = np.full([n + 2 * targets.MARGIN for n in shape], 0.003)  # a night sky over a suburb
+    steps = [range(targets.MARGIN + spacing // 2, n + targets.MARGIN - spacing // 4, spacing) for n in shape]
     t = np.arange(-24, 25)
     taper = np.cos(np.linspace(-np.pi / 2, np.pi / 2, 49)) ** 0.5
-    for place in itertools.product(step_r, step_c):
-        r, c = place + rng.uniform(-0.15, 0.15, 2) * spacing
+    for place in itertools.product(*steps):
+        at = np.array(place) + rng.uniform(-0.15, 0.15, 2) * spacing
         flux = 0.25 * 10.0 ** rng.uniform(0.0, 0.7)
-        rows, cols = t + round(r), t + round(c)
-        plane[np.ix_(rows, cols)] += flux * np.outer(np.sinc(rows - r) * taper, np.sinc(cols - c) * taper)
-    return (plane + 0.003).astype(np.float32)  # a night sky over a suburb
+        pixels = [t + round(each) for each in at]
+        rows, cols = (np.sinc(each - middle) * taper for each, middle in zip(pixels, at, strict=True))
+        plane[np.ix_(*pixels)] += flux * np.outer(rows, cols)
+    return plane.astype(np.float32)
 
 
 def moved_scene(scene: np.ndarray, shift: tuple[float, float], turn_deg: float) -> np.ndarray:
@@ -167,18 +166,14 @@ def test_too_few_pixels_determine_no_kernel() -> None:
 # --- the page -----------------------------------------------------------------------------------
 
 
-def test_a_page_is_the_same_each_time_and_differs_from_the_others() -> None:
-    one, again, other = (TargetPage(detail).samples for detail in (300, 300, 301))
-    assert np.array_equal(one, again)
-    assert not np.array_equal(one, other[: one.shape[0], : one.shape[1]])
+def test_a_page_is_the_same_each_time_and_passes_through_samples_of_its_own() -> None:
+    page, again, other = (TargetPage(detail) for detail in (300, 300, 301))
+    rows, cols = np.meshgrid(np.arange(80.0, 110.0), np.arange(120.0, 160.0), indexing="ij")
 
-
-def test_the_page_passes_through_its_samples() -> None:
-    page = TargetPage(300)
-    rows, cols = np.meshgrid(np.arange(80, 110), np.arange(120, 160), indexing="ij")
-    seen = page.at(rows.astype(float), cols.astype(float))
+    assert np.array_equal(page.samples, again.samples)
+    assert not np.array_equal(page.samples, other.samples[: page.shape[0], : page.shape[1]])
     # what ink and paper cut off moves a few of them a little
-    assert np.median(np.abs(seen - page.samples[80:110, 120:160])) < 0.02
+    assert np.median(np.abs(page.at(rows, cols) - page.samples[80:110, 120:160])) < 0.02
 
 
 @pytest.mark.parametrize("paper", ["a4", "letter", "tabloid"])
@@ -286,22 +281,10 @@ def target_photo() -> LinearPhoto:
     return photo_of(scene, lopsided())
 
 
-@pytest.mark.parametrize("details", [(500,), pytest.param((400, 500), marks=pytest.mark.slow)])
-def test_a_target_is_found_and_gives_the_kernel_as_it_is(
-    target_photo: LinearPhoto, monkeypatch: pytest.MonkeyPatch, details: tuple[int, ...]
-) -> None:
-    placed: list[PlacedPage] = []
-    find = Target.find
-
-    def noted(self: Target, photo: LinearPhoto, on_step: StepHook) -> PlacedPage:
-        placed.append(find(self, photo, on_step))
-        return placed[-1]
-
-    monkeypatch.setattr(Target, "find", noted)  # to find a page takes longer than all the rest
-    method = Target(across=2, down=1, side=88, details=details)
+def test_a_target_gives_the_kernel_as_it_is(target_photo: LinearPhoto) -> None:
+    method = Target(across=2, down=1, side=88, details=(500,))
     steps: list[tuple[int, int]] = []
     found = method.measure([target_photo], size=21, channels=("g",), on_step=lambda *step: steps.append(step))
-    assert [page.page.detail for page in placed] == [500]
     assert found
     assert steps.count((0, 1)) > 50  # a page that is still looked for shows that, too
     for one in found:
@@ -311,9 +294,9 @@ def test_a_target_is_found_and_gives_the_kernel_as_it_is(
         assert distance(np.rot90(one.kernel, 2), lopsided()).rel_l2 > 3 * seen
 
 
-def test_a_photo_without_a_target_is_refused() -> None:
-    with pytest.raises(NotEnoughEvidenceError, match="corner discs"):
-        Target(details=(500,)).measure([grey_photo()], size=21)
+@pytest.mark.slow  # of two pages
+def test_a_target_is_told_from_another(target_photo: LinearPhoto) -> None:
+    assert Target(side=88, details=(400, 500)).find(target_photo, ignore_step).page.detail == 500
 
 
 def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
@@ -338,10 +321,9 @@ def test_points_sharper_than_pixels_state_what_their_kernel_does_not_explain() -
 
     rng = np.random.default_rng(0)
     scene = np.full([n + 2 * targets.MARGIN for n in SHAPE], 0.003)
-    for row in range(targets.MARGIN + 30, SHAPE[0], 56):
-        for col in range(targets.MARGIN + 30, SHAPE[1], 56):
-            light = np.outer(seen_by_pixels(rng.uniform(-0.5, 0.5)), seen_by_pixels(rng.uniform(-0.5, 0.5)))
-            scene[row - 10 : row + 11, col - 10 : col + 11] += 0.5 * light
+    for row, col in itertools.product(*(range(targets.MARGIN + 30, side, 56) for side in SHAPE)):
+        light = np.outer(*(seen_by_pixels(off) for off in rng.uniform(-0.5, 0.5, 2)))
+        scene[row - 10 : row + 11, col - 10 : col + 11] += 0.5 * light
     found = Points(across=2, down=1).measure([photo_of(scene, np.ones((1, 1)))], size=21, channels=("g",))
     truth = np.outer(seen_by_pixels(0.0), seen_by_pixels(0.0))
     for one in found:
@@ -349,11 +331,10 @@ def test_points_sharper_than_pixels_state_what_their_kernel_does_not_explain() -
         assert 0.5 < one.error / seen < 2.0
 
 
-@pytest.mark.parametrize("across", [7, 1])
-def test_an_ordinary_photo_is_called_no_photo_of_points(across: int) -> None:
+def test_an_ordinary_photo_is_called_no_photo_of_points() -> None:
     scene = simulate.demo_scene("city")[1, : SHAPE[0] + 56, : SHAPE[1] + 56]
     with pytest.raises(NotEnoughEvidenceError, match="no photo of points") as refusal:
-        Points(across=across, down=1).measure([photo_of(scene, lopsided())], size=21)
+        Points().measure([photo_of(scene, lopsided())], size=21)
     assert "expose" not in str(refusal.value)
 
 
@@ -393,29 +374,23 @@ def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
 def test_what_demosaicing_makes_up_does_not_come_into_the_kernel_of_a_pair(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    rng = np.random.default_rng(6)
     sides = [n + 2 * targets.MARGIN for n in SHAPE]
     f = np.hypot(np.fft.fftfreq(sides[0])[:, None], np.fft.rfftfreq(sides[1]))
-    natural = np.fft.irfft2(np.fft.rfft2(rng.standard_normal(sides)) / np.maximum(f, 0.01), sides)
+    waves = np.fft.rfft2(np.random.default_rng(6).standard_normal(sides)) / np.maximum(f, 0.01)
+    natural = np.fft.irfft2(waves, sides)
     scene = np.clip(0.4 + 0.12 * natural / natural.std(), 0.05, 0.9)
     moved = moved_scene(scene.astype(np.float32), (0.4, -0.7), 0.05)
-    pair = [demosaiced(photo_of(scene, lopsided())), demosaiced(photo_of(moved, at_f8(), 1, 8.0))]
+    pair = [photo_of(scene, lopsided()), photo_of(moved, at_f8(), 1, 8.0)]
+    for photo in pair:  # green as the sensor saw it on a checkerboard, and the mean of neighbours between
+        seen = np.indices(SHAPE).sum(axis=0) % 2 == 1
+        cross = [[0, 0.25, 0], [0.25, 0, 0.25], [0, 0.25, 0]]
+        photo.planes[1] += np.where(
+            seen, 0.0, ndimage.convolve(photo.planes[1] * seen, cross) - photo.planes[1]
+        )
 
     now = error_of_pair(pair, 128)
     monkeypatch.setattr("lensmodel.measured.pair._ALIASED", 0.0)
     assert now < 0.8 * error_of_pair(pair, 128)
-
-
-def demosaiced(photo: LinearPhoto) -> LinearPhoto:
-    """The photo as it is where the sensor saw green on a checkerboard, and the mean of neighbours between."""
-    rows, cols = np.indices(photo.planes.shape[1:]) % 2
-    seen = np.asarray(photo.cfa)[rows, cols] == 1
-    between = signal.convolve2d(
-        np.where(seen, photo.planes[1], 0.0), [[0, 0.25, 0], [0.25, 0, 0.25], [0, 0.25, 0]], mode="same"
-    )
-    planes = photo.planes.copy()
-    planes[1] = np.where(seen, planes[1], between)
-    return replace(photo, planes=planes)
 
 
 def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
@@ -428,14 +403,21 @@ def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
 
 
 @pytest.mark.parametrize(
-    ("photos", "size", "said"),
-    [(2, 21, "two stops"), (1, 21, "takes 2 photos"), (2, 20, "an odd side .* got 20")],
+    ("method", "photos", "size", "said"),
+    [
+        (AperturePair(), 2, 21, "two stops"),
+        (AperturePair(), 1, 21, "takes 2 photos"),
+        (AperturePair(), 2, 20, "an odd side .* got 20"),
+        (Target(details=(500,)), 1, 21, "corner discs"),
+        (SlantedEdges(), 1, 21, "no chart was found"),
+        (Points(), 1, 21, "0 isolated points of light"),
+    ],
 )
-def test_a_pair_of_one_aperture_one_photo_and_even_sizes_are_refused(
-    photos: int, size: int, said: str
+def test_photos_that_show_nothing_of_a_method_are_refused(
+    method: Measurer, photos: int, size: int, said: str
 ) -> None:
-    with pytest.raises(InvalidInputError, match=said):
-        AperturePair().measure([grey_photo()] * photos, size=size)
+    with pytest.raises((InvalidInputError, NotEnoughEvidenceError), match=said):
+        method.measure([grey_photo()] * photos, size=size)
 
 
 @pytest.mark.parametrize("covariance", [[[3.0, 0.0], [0.0, 0.8]], [[1.9, 1.1], [1.1, 1.9]]])
@@ -462,22 +444,18 @@ def test_squares_give_red_its_own_kernel_where_demosaicing_gave_it_the_sharpness
 # --- samples and models -------------------------------------------------------------------------
 
 
-def test_measured_samples_join_or_replace_blind_ones(target_photo: LinearPhoto) -> None:
-    place = measure.MeasuredPsf(
-        resized(lopsided(), 11), target_photo.frame.position(100, 100), "g", 0.04, (100.0, 100.0), 144
+def test_measured_samples_join_or_replace_blind_ones() -> None:
+    photo, method = grey_photo(), measure.methods.create("target")
+    place = measure.MeasuredPsf(gaussian(11, np.eye(2)), photo.frame.position(9, 9), "g", 0.04, (9.0, 9.0), 9)
+    old, other, new = (
+        measure.samples_of([place], method, photo, photo_id=name, settings=LensSettings(aperture=n))
+        for n, name in ((2.0, "old"), (5.6, "other"), (2.0, "new"))
     )
-    method = measure.methods.create("target")
-    old, other, samples = (
-        measure.samples_of([place], method, target_photo, photo_id=photo, settings=LensSettings(aperture=n))
-        for n, photo in ((2.0, "old"), (5.6, "other"), (2.0, "new"))
-    )
-    blind = [replace(sample, estimator="blind/1") for sample in (*old, *other)]
-    assert samples[0].estimator == "measured-target/1"
-    assert samples[0].measured
-    model = LensModel.fit(blind)
-    assert [s.photo for s in joined(model, samples).samples] == ["old", "other", "new"]
-    assert [s.photo for s in joined(model, samples, replace=True).samples] == ["other", "new"]
-    assert resized(samples[0].kernel, 21).shape == (21, 21)
+    assert new[0].estimator == "measured-target/1"
+    assert new[0].measured
+    model = LensModel.fit([replace(sample, estimator="blind/1") for sample in (*old, *other)])
+    assert [s.photo for s in joined(model, new).samples] == ["old", "other", "new"]
+    assert [s.photo for s in joined(model, new, replace=True).samples] == ["other", "new"]
 
 
 def test_a_measurement_needs_an_aperture() -> None:

@@ -18,16 +18,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
-from scipy import ndimage, spatial
+from scipy import ndimage, signal, spatial
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
-from lensmodel.core.types import CHANNELS, Channel, StepHook
+from lensmodel.core.types import CHANNELS, Channel, NoiseModel, StepHook
 from lensmodel.measured.measurer import (
     NEAR_CLIP,
     Found,
@@ -89,7 +88,9 @@ class Points(Measurer):
         def sky(channel: Channel) -> NDArray[np.float64]:
             return sky_of(np.asarray(photo.planes[CHANNELS.index(channel)], np.float64))[0]
 
-        return good, lambda cell, channel: _cell_psf(photo, channel, cell[:_MOST], size, sky(channel))
+        return good, lambda cell, channel: _cell_psf(
+            photo, channel, np.array(cell[:_MOST]), size, sky(channel)
+        )
 
 
 def _is_usable(photo: LinearPhoto, row: float, col: float, size: int) -> bool:
@@ -103,113 +104,105 @@ def _is_usable(photo: LinearPhoto, row: float, col: float, size: int) -> bool:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Stamp:
-    """One light: its window, that without sky, where it is in it, and the sky's level."""
+class _Lights:
+    """Lights of a cell in one colour, each in a window of its own."""
 
-    window: Window
-    observed: NDArray[np.float64]
-    place: tuple[float, float]
-    flux: float
-    pixel: tuple[float, float]
-    sky: float
+    noise: NoiseModel
+    observed: NDArray[np.float64]  # (n, size, size), less the sky
+    measured: NDArray[np.bool_]
+    sky: NDArray[np.float64]  # (n, 1, 1), its level
+    places: NDArray[np.float64]  # (n, 2), in the windows
+    fluxes: NDArray[np.float64]  # (n,)
 
-    def latent(self, size: int) -> NDArray[np.float64]:
-        """The light as a sinc, on the window with a margin of half a kernel."""
-        side = self.observed.shape[0] + 2 * (size // 2)
-        t = np.arange(side) - size // 2
-        return self.flux * np.outer(np.sinc(t - self.place[0]), np.sinc(t - self.place[1]))
+    def latent(self) -> NDArray[np.float64]:
+        """Sincs, on the windows with a margin of half a kernel."""
+        size = self.observed.shape[1]
+        t = np.arange(2 * size - 1) - size // 2
+        down, along = np.sinc(t - self.places.T[..., None])
+        return self.fluxes[:, None, None] * down[:, :, None] * along[:, None, :]
 
     def blurred(self, kernel: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the pixels of the window see of it behind a kernel."""
-        return np.asarray(scipy.signal.fftconvolve(self.latent(len(kernel)), kernel, mode="valid"))
+        """What the pixels of the windows see of them behind a kernel."""
+        return np.asarray(signal.fftconvolve(self.latent(), kernel[None], mode="valid", axes=(1, 2)))
 
     def variance(self, light: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Variance of the noise of its pixels where they have so much light above the sky."""
-        noise = self.window.noise
-        return noise.shot * (self.sky + np.maximum(light, 0.0)) + noise.read
+        """Variance of the noise of pixels that have so much light above the sky."""
+        return self.noise.shot * (self.sky + np.maximum(light, 0.0)) + self.noise.read
 
 
 def _cell_psf(
     photo: LinearPhoto,
     channel: Channel,
-    lights: Sequence[tuple[float, float]],
+    pixels: NDArray[np.float64],
     size: int,
     sky: NDArray[np.float64],
 ) -> Found:
     """Stack the lights of a cell, and solve for their kernel."""
-    stamps = [_stamp(photo, channel, light, size, sky) for light in lights]
-    stamps = [stamp for stamp in stamps if stamp.flux > 0.0 and stamp.window.measured.sum() > size]
-    if len(stamps) < _FEWEST:
+    corners = np.rint(pixels).astype(int) - size // 2
+    windows = [Window.of(photo, channel, (int(top), int(left)), size) for top, left in corners]
+    behind = np.stack([sky[top : top + size, left : left + size] for top, left in corners])
+    observed = np.stack([window.light for window in windows]) - behind
+    measured = np.stack([window.measured for window in windows])
+    fluxes = observed.sum(axis=(1, 2))
+    seen = (fluxes > 0.0) & (measured.sum(axis=(1, 2)) > size)
+    if seen.sum() < _FEWEST:
         raise NotEnoughEvidenceError("fewer lights than a cell must have are seen in this colour")
-    solved = _stacked(stamps, size, None)
-    left = _unexplained(stamps, solved)
+    level = np.maximum(behind.mean(axis=(1, 2), keepdims=True), 0.0)
+    parts = observed, measured, level, pixels - corners, fluxes
+    lights = _Lights(windows[0].noise, *(part[seen] for part in parts))
+    solved = _stacked(lights, None)
+    left = _unexplained(lights, solved)
     for _ in range(_ROUNDS - 1):
         # sharper than pixels, lights are no sums of sincs, and the centres that suit sincs best are wrong
-        moved = [_refined(stamp, solved.kernel) for stamp in stamps]
-        again = _stacked(moved, size, solved.kernel)
+        moved = _refined(lights, solved.kernel)
+        again = _stacked(moved, solved.kernel)
         if (rest := _unexplained(moved, again)) >= left:
             break
-        stamps, solved, left = moved, again, rest
-    weights = np.array([stamp.flux for stamp in stamps])
-    middle = np.average([stamp.pixel for stamp in stamps], axis=0, weights=weights)
+        lights, solved, left = moved, again, rest
+    middle = np.average(pixels[seen], axis=0, weights=lights.fluxes)
     return Found(centred(solved.kernel), math.hypot(solved.error, left), middle, size)
 
 
-def _stamp(
-    photo: LinearPhoto, channel: Channel, pixel: tuple[float, float], size: int, sky: NDArray[np.float64]
-) -> _Stamp:
-    top, left = round(pixel[0]) - size // 2, round(pixel[1]) - size // 2
-    window = Window.of(photo, channel, (top, left), size)
-    behind = sky[top : top + size, left : left + size]
-    observed, level = window.light - behind, max(float(behind.mean()), 0.0)
-    place = pixel[0] - top, pixel[1] - left
-    return _Stamp(window, observed, place, float(observed.sum()), pixel, level)
-
-
-def _stacked(stamps: Sequence[_Stamp], size: int, kernel: NDArray[np.float64] | None) -> Solved:
-    """Solve for the kernel of all stamps at once: they stand below each other, apart by what pads them.
+def _stacked(lights: _Lights, kernel: NDArray[np.float64] | None) -> Solved:
+    """Solve for the kernel of all lights at once: they stand below each other, apart by what pads them.
 
     `kernel` is that of the round before, by which the noise of each pixel is known.
     """
-    latent = np.concatenate([stamp.latent(size) for stamp in stamps])
-    observed = np.zeros((latent.shape[0] - size + 1, size))
-    measured, variance = np.zeros(observed.shape, dtype=bool), np.ones(observed.shape)
-    for number, stamp in enumerate(stamps):
-        rows = slice(number * (2 * size - 1), number * (2 * size - 1) + size)
-        observed[rows], measured[rows] = stamp.observed, stamp.window.measured
-        light = np.full((size, size), stamp.flux / size**2) if kernel is None else stamp.blurred(kernel)
-        variance[rows] = stamp.variance(light)
-    return solve(observed, latent, measured, variance, size, even=True)
+    size = lights.observed.shape[1]
+
+    def below(windows: NDArray[Any]) -> NDArray[Any]:
+        return np.pad(windows, ((0, 0), (0, size - 1), (0, 0))).reshape(-1, size)[: 1 - size]
+
+    even = np.broadcast_to(lights.fluxes[:, None, None] / size**2, lights.observed.shape)
+    variance = lights.variance(even if kernel is None else lights.blurred(kernel))
+    latent = lights.latent().reshape(-1, 2 * size - 1)
+    return solve(below(lights.observed), latent, below(lights.measured), below(variance), size, even=True)
 
 
-def _unexplained(stamps: Sequence[_Stamp], solved: Solved) -> float:
+def _unexplained(lights: _Lights, solved: Solved) -> float:
     """Return what a kernel leaves of the lights beyond their noise, as a relative L2."""
-    rest, power = 0.0, 0.0
-    for stamp in stamps:
-        good, light = stamp.window.measured, stamp.blurred(solved.kernel * solved.light)
-        rest += float((np.square(stamp.observed - light) - stamp.variance(light))[good].sum())
-        power += float(np.square(stamp.observed[good]).sum())
-    return math.sqrt(max(rest, 0.0) / power)
+    light, good = lights.blurred(solved.kernel * solved.light), lights.measured
+    rest = float((np.square(lights.observed - light) - lights.variance(light))[good].sum())
+    return math.sqrt(max(rest, 0.0) / float(np.square(lights.observed[good]).sum()))
 
 
-def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:
-    """Move and scale a light so that the kernel explains its pixels best: one Gauss-Newton step."""
+def _refined(lights: _Lights, kernel: NDArray[np.float64]) -> _Lights:
+    """Move and scale lights so that the kernel explains their pixels best: one Gauss-Newton step."""
     step = 0.05
 
-    def moved(row: float, col: float) -> _Stamp:
-        return replace(stamp, place=(stamp.place[0] + row, stamp.place[1] + col))
+    def moved(by: NDArray[np.float64]) -> NDArray[np.float64]:
+        return replace(lights, places=lights.places + by).blurred(kernel)
 
-    by_row, by_col = (
-        (moved(*d).blurred(kernel) - moved(*np.negative(d)).blurred(kernel)) / (2 * step)
-        for d in ((step, 0.0), (0.0, step))
-    )
-    predicted, good = stamp.blurred(kernel), stamp.window.measured
-    basis = np.stack([predicted, by_row, by_col, np.ones_like(predicted)], axis=-1)[good]
-    terms, *_ = np.linalg.lstsq(basis, stamp.observed[good], rcond=None)
-    if not terms[0] > 0.0:
-        return stamp
-    row, col = np.clip(terms[1:3] / terms[0], -0.5, 0.5)
-    return replace(moved(float(row), float(col)), flux=stamp.flux * float(terms[0]))
+    by_row, by_col = ((moved(by) - moved(-by)) / (2 * step) for by in step * np.eye(2))
+    predicted = lights.blurred(kernel)
+    basis = np.stack([predicted, by_row, by_col, np.ones_like(predicted)], axis=-1)
+    places, fluxes = lights.places.copy(), lights.fluxes.copy()
+    for i, good in enumerate(lights.measured):
+        (scale, *change, _), *_ = np.linalg.lstsq(basis[i, good], lights.observed[i, good], rcond=None)
+        if scale > 0.0:
+            places[i] += np.clip(np.array(change) / scale, -0.5, 0.5)
+            fluxes[i] *= scale
+    return replace(lights, places=places, fluxes=fluxes)
 
 
 _SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by: fainter ones add noise (chosen)

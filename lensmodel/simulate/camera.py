@@ -227,17 +227,13 @@ def _hat(node: int, spacing: int, length: int) -> tuple[slice, NDArray[np.float6
 
 def _between(exact: NDArray[np.float32], rows: int, cols: int) -> NDArray[np.float32]:
     """Kernels of all nodes, `(rows, cols, k, k)`, by cubic splines through the exact ones."""
-    fine = np.tensordot(_spline(exact.shape[0], rows), exact, axes=(1, 0))
-    fine = np.tensordot(_spline(exact.shape[1], cols), fine, axes=(1, 1)).swapaxes(0, 1)
+    down, across = (
+        CubicSpline(np.arange(known), np.eye(known))(np.linspace(0.0, known - 1.0, wanted)).astype(np.float32)
+        for known, wanted in zip(exact.shape[:2], (rows, cols), strict=True)
+    )
+    fine = np.tensordot(across, np.tensordot(down, exact, axes=(1, 0)), axes=(1, 1)).swapaxes(0, 1)
     fine = np.maximum(fine, 0.0)
     return np.asarray(fine / fine.sum(axis=(2, 3), keepdims=True), dtype=np.float32)
-
-
-def _spline(known: int, wanted: int) -> NDArray[np.float32]:
-    """Matrix `(wanted, known)` of cubic spline interpolation at `known` even places."""
-    places = np.arange(known, dtype=np.float64)
-    basis = CubicSpline(places, np.eye(known))
-    return np.asarray(basis(np.linspace(0.0, known - 1.0, wanted)), dtype=np.float32)
 
 
 @lru_cache(maxsize=2048)  # photos of one lens and frame share all their kernels, 50 MB at most

@@ -31,7 +31,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, replace
 from functools import lru_cache
 from typing import Any, Final, Protocol, TypeAlias
 
@@ -46,12 +46,6 @@ from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, 
 DEFAULT_PITCH_UM: Final = 4.5  # micrometres: a full-frame sensor of 42 megapixels
 DEFAULT_SIZE: Final = 55  # pixels: the largest kernel that the paper estimates
 _BAND_UM: Final = 0.035  # half the distance between the outer wavelengths of one colour channel
-
-
-def spectrum(channel: Channel) -> tuple[tuple[float, float], ...]:
-    """Wavelengths in micrometres of a colour channel, with their weights."""
-    middle = WAVELENGTH_NM[channel] / 1000.0
-    return (middle - _BAND_UM, 0.25), (middle, 0.5), (middle + _BAND_UM, 0.25)
 
 
 class CameraLens(Hashable, Protocol):
@@ -162,12 +156,11 @@ class SimulatedLens:
         """Kernel at field vector `h` (right, up), also outside the frame; see `CameraLens`."""
         if not 0.5 <= pitch_um <= 50.0:
             raise InvalidInputError(f"pixel pitch must lie in 0.5..50 um, got {pitch_um}")
-        n = self.f_number(settings)
+        n, middle = self.f_number(settings), WAVELENGTH_NM[settings.channel] / 1000.0
+        waves = (middle - _BAND_UM, 0.25), (middle, 0.5), (middle + _BAND_UM, 0.25)  # with their weights
         pupil = Pupil.of(self.at_focal(settings.focal_mm), h, n)
-        (col, row), spread = pupil.ray_spot(WAVELENGTH_NM[settings.channel] / 1000.0, n)
-        response = pixel_otf(
-            pupil, spectrum(settings.channel), size=size, pitch_um=pitch_um, f_number=n, spread_um=spread
-        )
+        (col, row), spread = pupil.ray_spot(middle, n)
+        response = pixel_otf(pupil, waves, size=size, pitch_um=pitch_um, f_number=n, spread_um=spread)
         return response.centred(size, (-row / pitch_um, col / pitch_um), offset)
 
     def field(self, settings: LensSettings | None = None) -> SimulatedField:
@@ -204,20 +197,6 @@ _MAX_SAMPLES: Final = 640  # across the transform: memory (chosen)
 _WRAP_MARGIN: Final = 1.2  # period of the discrete transform over the extent of the light
 _CENTRED_PX: Final = 5e-4  # pixels: far below what any test asks
 _DETAILED_CUTOFF: Final = 3.5  # cycles/pixel
-
-
-def disc(
-    px: NDArray[np.float32],
-    py: NDArray[np.float32],
-    step: float,
-    *,
-    radius: float = 1.0,
-    center: tuple[float, float] = (0.0, 0.0),
-) -> NDArray[np.float32]:
-    """Disc with an edge one sample wide: a hard one's diffraction wings would wrap around the transform."""
-    dx, dy = px - np.float32(center[0]), py - np.float32(center[1])
-    rho = np.sqrt(dx * dx + dy * dy)
-    return np.clip((np.float32(radius) - rho) / np.float32(step) + np.float32(0.5), 0.0, 1.0)
 
 
 def coordinates(samples: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -337,12 +316,11 @@ class Aberrations:
 
     def mixed(self, other: Aberrations, share: float) -> Aberrations:
         """Optics between two focal lengths: every term linear in `share` of `other`."""
-        values: dict[str, Any] = {}
-        for each in fields(self):
-            a, b = np.asarray(getattr(self, each.name)), np.asarray(getattr(other, each.name))
-            mixed = (a + share * (b - a)).tolist()
-            values[each.name] = tuple(mixed) if isinstance(mixed, list) else mixed
-        return Aberrations(**values)
+        values: list[Any] = []
+        for a, b in zip(astuple(self), astuple(other), strict=True):
+            mixed = (np.asarray(a) + share * np.subtract(b, a)).tolist()
+            values.append(tuple(mixed) if isinstance(mixed, list) else mixed)
+        return Aberrations(*values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -361,26 +339,17 @@ class Pupil:
         """Collect the terms at field vector `h` and aperture `f_number`."""
         s = optics.f_number / f_number
         x, y = h[0] - optics.decentring[0], h[1] - optics.decentring[1]
-        focus = (
-            optics.defocus
-            + optics.tilt[0] * h[0]
-            + optics.tilt[1] * h[1]
-            + optics.field_curvature * (x * x + y * y)
-        )
-        a, b = optics.uniform_astigmatism
-        w222, s2, s3 = optics.astigmatism, s * s, s * s * s
+        tilt = optics.tilt[0] * h[0] + optics.tilt[1] * h[1]
+        focus = optics.defocus + tilt + optics.field_curvature * (x * x + y * y)
+        (a, b), w222 = optics.uniform_astigmatism, optics.astigmatism
+        quadratic = focus + w222 * x * x + a, 2.0 * w222 * x * y + 2.0 * b, focus + w222 * y * y - a
+        cubic = optics.coma * x + optics.uniform_coma[0], optics.coma * y + optics.uniform_coma[1]
         radius, shift = optics.vignetting
+        s2, s3 = s * s, s * s * s
         return cls(
             quartic=optics.spherical * s2 * s2,
-            cubic=(
-                (optics.coma * x + optics.uniform_coma[0]) * s3,
-                (optics.coma * y + optics.uniform_coma[1]) * s3,
-            ),
-            quadratic=(
-                (focus + w222 * x * x + a) * s2,
-                (2.0 * w222 * x * y + 2.0 * b) * s2,
-                (focus + w222 * y * y - a) * s2,
-            ),
+            cubic=(cubic[0] * s3, cubic[1] * s3),
+            quadratic=(quadratic[0] * s2, quadratic[1] * s2, quadratic[2] * s2),
             colour=(optics.colour_focus[0] * s2, optics.colour_focus[1] * s2),
             radius=radius / s,
             center=(shift * x / s, shift * y / s),
@@ -415,11 +384,20 @@ class Pupil:
         return np.asarray(gx, dtype=np.float64), np.asarray(gy, dtype=np.float64)
 
     def amplitude(self, px: NDArray[np.float32], py: NDArray[np.float32], step: float) -> NDArray[np.float32]:
-        """Transmission 0..1 at pupil coordinates that broadcast together, `step` apart."""
-        stop = disc(px, py, step)
+        """Transmission 0..1 at pupil coordinates that broadcast together, `step` apart.
+
+        Edges are one sample wide: the diffraction wings of hard ones would wrap around the transform.
+        """
+
+        def disc(radius: float, x: float, y: float) -> NDArray[np.float32]:
+            dx, dy = px - np.float32(x), py - np.float32(y)
+            rho = np.sqrt(dx * dx + dy * dy)
+            return np.clip((np.float32(radius) - rho) / np.float32(step) + np.float32(0.5), 0.0, 1.0)
+
+        stop = disc(1.0, 0.0, 0.0)
         if self.radius <= 0.0 or self.radius >= 1.0 + math.hypot(*self.center) + step:
             return stop
-        return stop * disc(px, py, step, radius=self.radius, center=self.center)
+        return stop * disc(self.radius, *self.center)
 
     def ray_spot(self, wavelength_um: float, f_number: float) -> tuple[tuple[float, float], float]:
         """Centre of the ray spot (right, up) and its largest radius, in micrometres."""

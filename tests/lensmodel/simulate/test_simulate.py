@@ -18,7 +18,7 @@ from PIL import Image
 from lab.kernels import distance
 from lab.model_benchmark import pixel_to_local
 from lensmodel.core.errors import InvalidInputError, NotAnImageError, UnknownMethodError
-from lensmodel.core.psf import centroid, rms_width, second_moments
+from lensmodel.core.psf import centroid, rms_width
 from lensmodel.core.types import Channel, FieldPosition, Frame, Kernel, LensSettings, Planes, zone_of
 from lensmodel.quality import edge_area
 from lensmodel.simulate import (
@@ -60,12 +60,12 @@ def otf_of(f_number: float, wavelength_um: float, size: int = 55, **terms: objec
     return pixel_otf(pupil, [(wavelength_um, 1.0)], size=size, pitch_um=PITCH, f_number=f_number)
 
 
-def third_moment(kernel: Kernel, phi: float) -> tuple[float, float]:
-    """Third moment of a centred kernel along u and along v, within its core."""
+def moments(kernel: Kernel, phi: float, order: int) -> tuple[float, float]:
+    """Moment of a centred kernel along u and along v, within its core."""
     kernel = np.where(kernel > 0.01 * kernel.max(), kernel, 0.0)
     t = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
     u, v = pixel_to_local(t[:, None], t[None, :], phi)
-    return float((kernel * u**3).sum()), float((kernel * v**3).sum())
+    return float((kernel * u**order).sum()), float((kernel * v**order).sum())
 
 
 @pytest.mark.parametrize(("f_number", "size"), [(2.8, 101), (4.0, 151), (11.0, 151)])
@@ -114,7 +114,7 @@ def test_positive_coma_throws_light_outwards_and_uniform_coma_as_named(
     terms: dict[str, object], r: float, phi: float
 ) -> None:
     kernel = lens(f_number=2.0, **terms).kernel(FieldPosition(r, phi), size=41)
-    along_u, along_v = third_moment(kernel, phi)
+    along_u, along_v = moments(kernel, phi, 3)
 
     assert along_u > 1.0
     assert abs(along_v) < 0.05 * along_u
@@ -123,10 +123,7 @@ def test_positive_coma_throws_light_outwards_and_uniform_coma_as_named(
 @pytest.mark.parametrize("phi", ANGLES)
 def test_astigmatism_stretches_along_u_at_every_angle(phi: float) -> None:
     kernel = lens(f_number=2.8, astigmatism=2.5).kernel(FieldPosition(0.9, phi), size=41)
-    rr, rc, cc = (second_moments(kernel)[i] for i in ((0, 0), (0, 1), (1, 1)))
-    c, s = math.cos(phi), math.sin(phi)
-    along_u = cc * c * c - 2 * rc * c * s + rr * s * s  # rows grow downwards
-    along_v = cc * s * s + 2 * rc * c * s + rr * c * c
+    along_u, along_v = moments(kernel, phi, 2)
 
     assert along_u > 3.0 * along_v
 
@@ -170,32 +167,29 @@ def test_tilt_blurs_the_side_that_it_names_and_longitudinal_colour_red_and_blue(
     assert most > 1.25 * least
 
 
-def test_stopped_down_wavefront_is_the_inner_part_of_the_open_one() -> None:
-    optics = Aberrations(
-        f_number=2.0, spherical=2.0, coma=1.0, astigmatism=0.7, defocus=-1.0, tilt=(0.2, 0.1)
-    )
-    h = (0.5, -0.4)
-    open_wave = Pupil.of(optics, h, 2.0).wavefront
-    closed = Pupil.of(optics, h, 4.0).wavefront
-    px = np.linspace(-1, 1, 9, dtype=np.float32)[None, :]
-    py = np.linspace(-1, 1, 7, dtype=np.float32)[:, None]
+OPTICS = Aberrations(
+    f_number=2.0, spherical=2.0, coma=1.5, astigmatism=0.7, defocus=-1.0, tilt=(0.2, 0.1),
+    uniform_astigmatism=(0.3, 0.4),
+)  # fmt: skip
 
-    np.testing.assert_allclose(closed(px, py, 0.6), open_wave(px / 2, py / 2, 0.6), atol=1e-5)
+
+def test_stopped_down_wavefront_is_the_inner_part_of_the_open_one() -> None:
+    whole, closed = (Pupil.of(OPTICS, (0.5, -0.4), n).wavefront for n in (2.0, 4.0))
+    px, py = (
+        np.linspace(-1, 1, 9, dtype=np.float32)[None, :],
+        np.linspace(-1, 1, 7, dtype=np.float32)[:, None],
+    )
+
+    np.testing.assert_allclose(closed(px, py, 0.6), whole(px / 2, py / 2, 0.6), atol=1e-5)
 
 
 def test_ray_gradient_is_the_derivative_of_the_wavefront() -> None:
-    optics = Aberrations(
-        f_number=2.0, spherical=2.0, coma=1.5, astigmatism=0.7, uniform_astigmatism=(0.3, 0.4)
-    )
-    pupil = Pupil.of(optics, (0.6, 0.3), 2.0)
-    x, y, e = 0.4, -0.3, 1e-3
+    pupil = Pupil.of(OPTICS, (0.6, 0.3), 2.0)
+    x, y, e = np.array([0.4]), np.array([-0.3]), 1e-3
+    ahead, behind = ((pupil.wavefront(x + d, y, 0.54), pupil.wavefront(x, y + d, 0.54)) for d in (e, -e))
+    slopes = np.subtract(ahead, behind) / (2 * e)
 
-    def w(px: float, py: float) -> float:
-        return float(pupil.wavefront(np.float64(px), np.float64(py), 0.54))  # type: ignore[arg-type]
-
-    gx, gy = pupil.gradient(np.float64(x), np.float64(y), 0.54)  # type: ignore[arg-type]
-    assert gx == pytest.approx((w(x + e, y) - w(x - e, y)) / (2 * e), rel=1e-3)
-    assert gy == pytest.approx((w(x, y + e) - w(x, y - e)) / (2 * e), rel=1e-3)
+    np.testing.assert_allclose(pupil.gradient(x, y, 0.54), slopes, rtol=1e-3)
 
 
 def test_finer_pixels_show_the_same_kernel_larger() -> None:
@@ -423,9 +417,13 @@ def test_demo_scenes_load_as_linear_light_and_are_listed_with_their_licence(name
     assert path.name in demo_data_path("README.md").read_text(encoding="utf-8")
 
 
-def test_srgb_curve_is_undone(tmp_path: Path) -> None:
+def test_pictures_load_with_the_srgb_curve_undone_and_other_files_not(tmp_path: Path) -> None:
     Image.fromarray(np.full((4, 6, 3), 188, dtype=np.uint8)).save(tmp_path / "grey.png")
+    (tmp_path / "text.png").write_bytes(b"no picture")
+
     assert load_scene(tmp_path / "grey.png") == pytest.approx(0.5029, abs=1e-3)
+    with pytest.raises(NotAnImageError):
+        load_scene(tmp_path / "text.png")
 
 
 # ---- what is refused
@@ -445,14 +443,11 @@ def light(level: float = 0.5, *, exposure: float = 1.0) -> None:
         (lambda: draw_lens(0).kernel(CENTER, size=30), "odd"),
         (lambda: draw_lens(0).kernel(CENTER, pitch_um=0.0), "pitch"),
         (lambda: Aberrations(coma=math.nan), "finite"),
-        (lambda: Aberrations(lateral_red=(0.0, math.inf)), "finite"),
         (lambda: Aberrations(f_number=-2.0), "f_number"),
         (lambda: SimulatedLens((Aberrations(), Aberrations()), (70.0, 24.0)), "ascending"),
         (lambda: SimulatedLens((Aberrations(),), (24.0, 70.0)), "one for each"),
-        (lambda: SimulatedLens((), ()), "one for each"),
         (lambda: draw_lens(1, "magic"), "known"),
         (lambda: SimulatedCamera(height=15), "height"),
-        (lambda: SimulatedCamera(width=8), "width"),
         (lambda: SimulatedCamera(pattern="RGBG"), "pattern"),
         (lambda: SimulatedCamera(black=20000), "black"),
         (lambda: SimulatedCamera(white_balance=(0.5, 1.0, 1.0)), "white_balance"),
@@ -473,9 +468,3 @@ def light(level: float = 0.5, *, exposure: float = 1.0) -> None:
 def test_impossible_requests_are_refused_with_the_reason(request_: Callable[[], object], said: str) -> None:
     with pytest.raises((InvalidInputError, UnknownMethodError), match=said):
         request_()
-
-
-def test_what_is_no_picture_is_no_scene(tmp_path: Path) -> None:
-    (tmp_path / "text.png").write_bytes(b"no picture")
-    with pytest.raises(NotAnImageError):
-        load_scene(tmp_path / "text.png")

@@ -45,6 +45,9 @@ _MIN_SIDE: Final = 16  # pixels (chosen): over it an edge of 2 degrees moves by 
 _MIN_ROWS: Final = 10  # that a line is fitted to: fewer do not tell which of them is off (chosen)
 _REACH: Final = 48.0  # pixels of edge spread on each side; more only adds noise
 _MAX_CORRECTION: Final = 10.0  # ISO 12233: limit of the division by the difference's response
+_LENGTH: Final = (
+    2048  # of its Fourier transform, over a profile of twice the reach: fine enough to interpolate
+)
 _MIN_STEP_OVER_NOISE: Final = 3.0  # standard deviations: weaker steps are noise (chosen)
 
 
@@ -123,18 +126,14 @@ def slanted_edge(plane: NDArray[np.floating], measured: NDArray[np.bool_] | None
     turned = down > across  # the edge lies: it is steep from row to row
     upright = crop.T if turned else crop
     intercept, slope, sign = _edge_line(upright)
-    cos = 1.0 / math.hypot(1.0, slope)
+    # normal of the edge in the upright crop, towards the bright side
+    d_col, d_row = sign * np.array([1.0, -slope]) / math.hypot(1.0, slope)
     rows, cols = upright.shape
-    x = np.arange(cols)[None, :] - (intercept + slope * np.arange(rows)[:, None])
+    x = np.arange(cols) - (intercept + slope * np.arange(rows)[:, None])
     used = np.ones(crop.shape, dtype=np.bool_) if measured is None else measured
-    distance, esf = _profile(x * cos * sign, upright, used.T if turned else used)
+    distance, esf = _profile(x * d_col, upright, used.T if turned else used)
     middle = (cols - 1) / 2.0 - (intercept + slope * (rows - 1) / 2.0)
     frequencies, mtf = _spectrum(esf)
-    # the normal in the upright crop: (1, -slope) in (column, row), towards the bright side
-    d_col, d_row = sign * 1.0, -sign * slope
-    if turned:
-        d_col, d_row = d_row, d_col
-    normal = math.atan2(-d_row, d_col)
     dark, bright = _levels(distance, esf)
     step = bright - dark
     return EdgeResponse(
@@ -143,8 +142,8 @@ def slanted_edge(plane: NDArray[np.floating], measured: NDArray[np.bool_] | None
         mtf50=crossing(frequencies, mtf, 0.5),
         overshoot=max(float(esf.max()) - bright, 0.0) / step * 100.0,
         undershoot=max(dark - float(esf.min()), 0.0) / step * 100.0,
-        normal=normal,
-        offset=-middle * cos * sign,
+        normal=math.atan2(-d_col, d_row) if turned else math.atan2(-d_row, d_col),
+        offset=float(-middle * d_col),
         step=step,
         esf_distance=distance,
         esf=esf,
@@ -155,8 +154,7 @@ def _edge_line(crop: NDArray[np.float64]) -> tuple[float, float, float]:
     """Line c(row) = intercept + slope row of a near-vertical edge; and +1 if bright is on the right."""
     rows, cols = crop.shape
     derivative = (crop[:, 2:] - crop[:, :-2]) / 2.0
-    x = np.arange(1, cols - 1, dtype=np.float64)
-    y = np.arange(rows, dtype=np.float64)
+    x, y = np.arange(1.0, cols - 1.0), np.arange(float(rows))
     quarter = max(cols // 4, 2)
     sign = 1.0 if crop[:, -quarter:].mean() >= crop[:, :quarter].mean() else -1.0
     # first windows: where the smoothed derivative of each row is largest, not blindly the middle,
@@ -239,18 +237,14 @@ def _levels(position: NDArray[np.float64], esf: NDArray[np.float64]) -> tuple[fl
 def _spectrum(esf: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """MTF of an edge profile on frequencies from 0 to 1 cycles/pixel."""
     lsf = (esf[2:] - esf[:-2]) / 2.0
-    t = np.arange(lsf.size, dtype=np.float64)
-    center = float(np.argmax(np.convolve(lsf, np.ones(OVERSAMPLING), "same")))
+    t = np.arange(lsf.size)
+    center = int(np.argmax(np.convolve(lsf, np.ones(OVERSAMPLING), "same")))
     reach = max(center, lsf.size - 1 - center) + 1.0
-    lsf = lsf * (0.54 + 0.46 * np.cos(np.pi * (t - center) / reach))
-    length = 2048
-    spectrum = np.abs(np.fft.rfft(lsf, length))
-    frequencies = np.fft.rfftfreq(length, 1.0 / OVERSAMPLING)
-    inside = frequencies <= 1.0
-    frequencies = frequencies[inside]
+    spectrum = np.abs(np.fft.rfft(lsf * (0.54 + 0.46 * np.cos(np.pi * (t - center) / reach)), _LENGTH))
+    frequencies = np.linspace(0.0, 1.0, _LENGTH // OVERSAMPLING + 1)
     known = np.sinc(2.0 * frequencies / OVERSAMPLING) * np.sinc(frequencies / OVERSAMPLING)
-    mtf = spectrum[inside] / spectrum[0] / np.maximum(known, 1.0 / _MAX_CORRECTION)
-    return np.asarray(frequencies, dtype=np.float64), np.asarray(mtf, dtype=np.float64)
+    mtf = spectrum[: frequencies.size] / spectrum[0] / np.maximum(known, 1.0 / _MAX_CORRECTION)
+    return frequencies, mtf
 
 
 def mtf_from_kernel(kernel: Kernel, angle: float, frequencies: ArrayLike) -> NDArray[np.float64]:
@@ -320,8 +314,7 @@ class FoundEdge:
 
     box: Box  # (row, col, height, width) of the window in its middle that was measured
     response: EdgeResponse  # what was measured there
-    # (row, col), of the straight part that was seen; corners lie up to half a window further out
-    ends: tuple[tuple[float, float], tuple[float, float]]
+    ends: NDArray[np.float64]  # (2, 2): row, col of both ends as seen; corners lie half a window further out
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -359,23 +352,20 @@ def _edge_on(
     plane: NDArray[np.floating], ends: NDArray[np.float64], noise: NoiseModel, clip: float
 ) -> FoundEdge | None:
     """Measure an edge between two ends in its middle, or beside it where the middle is spoilt."""
-    (row_1, col_1), (row_2, col_2) = ends.tolist()
     for share in (0.5, 0.25, 0.75):
-        row, col = ends[0] + share * (ends[1] - ends[0])
         for side in SIDES:
-            top, left = round(row) - side // 2, round(col) - side // 2
+            top, left = (round(at) - side // 2 for at in ends[0] + share * (ends[1] - ends[0]))
             if min(top, left) < 0 or top + side > plane.shape[0] or left + side > plane.shape[1]:
                 continue
             response = _edge_of(plane[top : top + side, left : left + side], noise, clip)
             if response is not None:
-                return FoundEdge((top, left, side, side), response, ((row_1, col_1), (row_2, col_2)))
+                return FoundEdge((top, left, side, side), response, ends)
     return None
 
 
 def _segments(means: NDArray[np.float32]) -> list[NDArray[np.float64]]:
     """Ends of edges, as runs of windows that each hold one straight edge and no more, strongest first."""
-    across = np.zeros_like(means)
-    down = np.zeros_like(means)
+    across, down = np.zeros((2, *means.shape), dtype=np.float32)
     across[:, 1:-1] = (means[:, 2:] - means[:, :-2]) / 2
     down[1:-1] = (means[2:] - means[:-2]) / 2
     xx, yy, xy = (_sums(product) for product in (across * across, down * down, across * down))
@@ -389,17 +379,15 @@ def _segments(means: NDArray[np.float32]) -> list[NDArray[np.float64]]:
     order = np.flatnonzero(good)
     order = order[np.argsort(-energy.ravel()[order], kind="stable")][:_MOST]
     middles = np.full((*energy.shape, 2), np.nan)
-    rising = np.zeros(energy.shape, dtype=np.int8)
+    kinds = np.zeros(energy.shape, dtype=np.int8)  # 1 upright, 2 lying, negative where it falls; 0 no edge
     for start in range(0, order.size, _CHUNK):
-        part = order[start : start + _CHUNK]
-        index = np.unravel_index(part, energy.shape)
-        kept, middle, sign = _on_one_line(across, down, index, angle.ravel()[part])
-        kind = np.where(np.abs(np.cos(angle.ravel()[part])) > math.sqrt(0.5), 1, 2) * sign
-        rising[index[0][kept], index[1][kept]] = kind[kept]
-        middles[index[0][kept], index[1][kept]] = middle[kept]
+        index = np.unravel_index(order[start : start + _CHUNK], energy.shape)
+        upright = np.abs(np.cos(angle[index])) > math.sqrt(0.5)
+        kept, middles[index], sign = _on_one_line(across, down, index, angle[index])
+        kinds[index] = np.where(kept, np.where(upright, 1, 2) * sign, 0)
     found: list[tuple[float, NDArray[np.float64]]] = []
-    for each in (-2, -1, 1, 2):
-        labels, _ = ndimage.label(rising == each, structure=np.ones((3, 3)))
+    for kind in (-2, -1, 1, 2):
+        labels, _ = ndimage.label(kinds == kind, structure=np.ones((3, 3)))
         for number, where in enumerate(ndimage.find_objects(labels), start=1):
             own = labels[where] == number
             found.append((float(energy[where][own].sum()), _ends(middles[where][own])))
@@ -488,9 +476,10 @@ def _unexplained(crop: NDArray[np.float64], normal: float) -> NDArray[np.float64
     rows, cols = np.indices(crop.shape)
     distance = cols * math.cos(normal) - rows * math.sin(normal)
     place = (distance - distance.min()) * 2
-    index = np.floor(place).astype(np.intp)
-    count = np.bincount(index.ravel(), minlength=index.max() + 2)
-    middle = np.bincount(index.ravel(), weights=place.ravel(), minlength=count.size)
-    total = np.bincount(index.ravel(), weights=crop.ravel(), minlength=count.size)
+    index = np.floor(place).astype(np.intp).ravel()
+    count = np.bincount(index)
     filled = count > 0
-    return crop - np.interp(place, middle[filled] / count[filled], total[filled] / count[filled])
+    middle, level = (
+        np.bincount(index, weights=each.ravel())[filled] / count[filled] for each in (place, crop)
+    )
+    return crop - np.interp(place, middle, level)

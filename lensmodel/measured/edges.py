@@ -45,7 +45,6 @@ from lensmodel.measured.target import on_paper
 from lensmodel.photo import LinearPhoto
 from lensmodel.quality import (
     OVERSAMPLING,
-    EdgeResponse,
     FoundEdge,
     crossing,
     edge_area,
@@ -146,15 +145,28 @@ class _Line(NamedTuple):
 
 
 def _line(photo: LinearPhoto, channel: Channel, edge: FoundEdge) -> _Line:
-    """Measure an edge; raises where that fails."""
+    """Measure an edge; raises where that fails. Phases are 0 at the middle of the light.
+
+    The derivative of the profile, tapered where only noise is left, transformed; what the difference over
+    two bins and the bins themselves take off is put back, as `quality` does.
+    """
     row, col, side, _ = edge.box
     window = Window.of(photo, channel, (row, col), side)
     response = slanted_edge(window.light, window.measured)
-    transfer, middle = _transfer(response)
-    normal = _unit(response.normal)
+    lsf = (response.esf[2:] - response.esf[:-2]) / 2.0
+    place = response.esf_distance[1:-1]
+    away = np.abs(place - place[np.argmax(np.convolve(lsf, np.ones(OVERSAMPLING), "same"))])
+    taper = np.clip((_REACH_PX + _TAPER_PX - away) / _TAPER_PX, 0.0, 1.0)
+    lsf = lsf * taper * taper * (3.0 - 2.0 * taper)
+    total = float(lsf.sum())
+    middle = float((lsf * place).sum()) / total
+    wave = np.exp(-2j * np.pi * _FREQUENCIES[:, None] * (place - middle))
+    known = np.sinc(2.0 * _FREQUENCIES / OVERSAMPLING) * np.sinc(_FREQUENCIES / OVERSAMPLING)
+    transfer = np.asarray((wave @ lsf) / total / known)
     half = crossing(_FREQUENCIES, np.abs(transfer), 0.5)
-    place = float(normal @ edge.middle) + response.offset + middle
-    return _Line(normal, place, transfer, math.log(2.0) / (2.0 * math.pi**2 * half**2))
+    normal = _unit(response.normal)
+    on_edge = float(normal @ edge.middle) + response.offset + middle
+    return _Line(normal, on_edge, transfer, math.log(2.0) / (2.0 * math.pi**2 * half**2))
 
 
 _Misfit: TypeAlias = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -208,26 +220,6 @@ def _drawn(
     return np.concatenate([spectra, changes])
 
 
-def _transfer(response: EdgeResponse) -> tuple[NDArray[np.complex128], float]:
-    """Transfer function along the normal at `_FREQUENCIES`, and the middle of the light: phases are 0 there.
-
-    The derivative of the profile, tapered where only noise is left, transformed; what the difference over
-    two bins and the bins themselves take off is put back, as `quality` does.
-    """
-    distance, esf = response.esf_distance, response.esf
-    lsf = (esf[2:] - esf[:-2]) / 2.0
-    place = distance[1:-1]
-    peak = float(place[int(np.argmax(np.convolve(lsf, np.ones(OVERSAMPLING), "same")))])
-    away = np.abs(place - peak)
-    taper = np.clip((_REACH_PX + _TAPER_PX - away) / _TAPER_PX, 0.0, 1.0)
-    lsf = lsf * taper * taper * (3.0 - 2.0 * taper)
-    total = float(lsf.sum())
-    middle = float((lsf * place).sum()) / total
-    wave = np.exp(-2j * np.pi * _FREQUENCIES[:, None] * (place - middle)[None, :])
-    known = np.sinc(2.0 * _FREQUENCIES / OVERSAMPLING) * np.sinc(_FREQUENCIES / OVERSAMPLING)
-    return np.asarray((wave @ lsf) / total / known, dtype=np.complex128), middle
-
-
 # --- the kernel ---------------------------------------------------------------------------------
 
 
@@ -267,8 +259,7 @@ def _square_psf(photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge
     half = math.ceil(_HALF_WIDTHS * math.sqrt(max(line.variance for line in lines)))
     half = min(max(half, _LEAST_HALF), _MOST_HALF)
     pairs = [(a, b) for a, b in combinations(lines, 2) if abs(a.normal @ b.normal) < math.cos(_CROSSING)]
-    around = [_corner(photo, channel, pair, half) for pair in pairs]
-    corners = [corner for corner in around if corner is not None]
+    corners = [seen for pair in pairs if (seen := _corner(photo, channel, pair, half)) is not None]
     if not corners:
         raise NotEnoughEvidenceError("no corner of the square is seen")
 

@@ -44,12 +44,6 @@ def test_an_upload_comes_back_as_a_photo(api: Client, tmp_path: Path) -> None:
     assert api.photos() == []
 
 
-def test_a_refusal_carries_the_problem(api: Client, tmp_path: Path) -> None:
-    with pytest.raises(ServiceProblemError, match="not_an_image") as caught:
-        api.upload(written(tmp_path / "x.txt", b"hello"))
-    assert caught.value.problem.status == 415
-
-
 def test_waiting_ends_when_the_job_does(api: Client, steps: Steps, store: Store) -> None:
     photo = steps.planned()
     steps.estimate(photo)
@@ -88,9 +82,9 @@ def test_waiting_leaves_a_service_in_peace_that_answers_at_once(
     with TestClient(create_app(settings)) as http:
         http.event_hooks["request"].append(asked.append)
         with pytest.raises(JobPatienceError):
-            Client(http=http).wait(photo.public_id, timeout=3.0)
+            Client(http=http).wait(photo.public_id, timeout=1.0)
 
-    assert 2 <= len(asked) <= 40  # without a pause it would be hundreds
+    assert 2 <= len(asked) <= 20  # without a pause it would be hundreds
 
 
 def test_a_service_that_fails_is_told_with_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

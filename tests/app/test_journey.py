@@ -129,7 +129,7 @@ def killed(service: Service, member: str) -> None:
     service.start()
 
 
-def test_a_killed_worker_or_api_ends_the_service_and_a_photo_counts_once(
+def test_a_killed_worker_ends_the_service_and_a_photo_counts_once(
     service: Service, first: dict[str, Any], photos: Path
 ) -> None:
     photo = service.upload(photos / "fourth.dng")
@@ -142,8 +142,6 @@ def test_a_killed_worker_or_api_ends_the_service_and_a_photo_counts_once(
 
     assert job["state"] == "succeeded", job
     assert event["samples_added"] <= 3 * service.get(f"/v1/photos/{photo['id']}")["patches"]["done"]
-    killed(service, "pid")
-    assert lens_of(service, first)["serial"] == "L-42"
 
 
 def test_a_second_service_on_the_same_data_is_refused_and_the_first_runs_on(service: Service) -> None:
@@ -165,14 +163,15 @@ def test_a_second_service_on_the_same_data_is_refused_and_the_first_runs_on(serv
     assert service.get("/readyz")["status"] == "ready"
 
 
+@pytest.mark.slow
 def test_a_service_whose_data_were_deleted_takes_nothing_from_the_next_one(tmp_path: Path) -> None:
-    with contextlib.closing(Service(tmp_path / "data")) as first:
+    with contextlib.closing(Service(tmp_path / "data", **OWN_ACCOUNT)) as first:
         first.start()
         assert first.process is not None
         first.process.send_signal(signal.SIGSTOP)  # so that it ends last
         os.kill(first.info()["worker_pid"], signal.SIGKILL)
         shutil.rmtree(first.data)
-        with running(first.data) as second:
+        with running(first.data, **OWN_ACCOUNT) as second:
             info = second.info()
             first.process.send_signal(signal.SIGCONT)
 
@@ -199,7 +198,12 @@ def test_the_parts_run_alone_for_installations_on_many_machines(tmp_path: Path) 
             part.wait()
 
 
-def test_work_that_a_stop_interrupted_goes_on_at_the_next_start(service: Service, photos: Path) -> None:
+@pytest.mark.slow
+def test_work_that_a_stop_interrupted_goes_on_at_the_next_start(
+    service: Service, first: dict[str, Any], photos: Path
+) -> None:
+    killed(service, "pid")
+    assert lens_of(service, first)["serial"] == "L-42"
     photo = service.upload(photos / "fifth.dng")
     service.job(photo["id"], until=at_work)
     pids = pids_of(service)
@@ -217,10 +221,11 @@ def test_work_that_a_stop_interrupted_goes_on_at_the_next_start(service: Service
     assert (job["state"], len(events)) == ("succeeded", 1), job
 
 
-@pytest.mark.parametrize("blank", [0, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("blank", [0, 60])
 def test_page_and_terminal_learn_one_lens_from_one_file(blank: int, tmp_path: Path) -> None:
     photo = write_photo(tmp_path / "first.dng", 0, blank=blank)
-    with running(tmp_path / "data", LENS_PATCHES="0") as alone:
+    with running(tmp_path / "data", LENS_PATCHES="0", **OWN_ACCOUNT) as alone:
         address = f"/v1/lenses/{alone.calibrated(photo)['lens_id']}/profile"
         page = read_profile(io.BytesIO(alone.http.get(address).content), "the profile of the page").model
 

@@ -39,6 +39,7 @@ def truth(photo: LinearPhoto, pixel: tuple[float, float], normal: float) -> floa
     return min(true_mtf50(ASTIGMATIC, photo.frame.position(*pixel), normal, CAMERA.pitch_um), 0.5)
 
 
+@pytest.mark.slow
 def test_every_square_of_the_chart_is_one_place(chart: tuple[LinearPhoto, tuple[Square, ...]]) -> None:
     photo, squares = chart
 
@@ -55,6 +56,7 @@ def test_every_square_of_the_chart_is_one_place(chart: tuple[LinearPhoto, tuple[
     assert sum(map(len, groups)) >= 0.95 * 4 * len(squares)
 
 
+@pytest.mark.slow
 def test_tangential_and_sagittal_are_not_mixed(chart: tuple[LinearPhoto, tuple[Square, ...]]) -> None:
     photo, _ = chart
 

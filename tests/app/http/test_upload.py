@@ -76,13 +76,6 @@ def test_fields_of_the_form_go_before_those_of_the_query(client: TestClient) -> 
     assert (answer.json()["aperture"], answer.json()["calibrate"]) == (4.0, False)
 
 
-def test_a_photo_may_name_who_chooses_its_patches(client: TestClient, store: Store) -> None:
-    row = store.photos.get(send(client, "selector=good-regions").json()["id"], "local")
-
-    assert row is not None
-    assert row.given == {"selector": "good-regions"}
-
-
 def test_a_body_in_small_pieces_arrives_whole(client: TestClient, settings: Settings) -> None:
     fields = ('name="aperture"', b"1.4"), ('name="lens_model"', b"x")
     body = form(fields[0], ('name="file"; filename="p.tif"', TIFF), fields[1])

@@ -197,9 +197,10 @@ def bench(settings: Settings, steps: Steps, tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_photo_goes_all_the_way(bench: Bench) -> None:
-    done = bench.work()
+    done = bench.work(bench.received(selector="good-regions"))
 
     assert (done.state, done.patches_done, done.width, done.aperture) == ("counted", 2, 600, 2.8)
+    assert bench.sandbox.seen["select"]["selector"] == "good-regions"
     assert (done.lens.version, done.lens.sample_count, done.lens.serial) == (1, 6, "123")
     assert bench.storage.get(f"photos/{done.public_id}/{answers.SHOWN}") == b"a small picture"
     _, samples = bench.steps.learned(done)
@@ -263,17 +264,6 @@ def test_only_unread_photos_that_wait_are_read_ahead(bench: Bench, monkeypatch: 
     read_ahead(bench.context, found)
 
     assert photos.unread() is None
-
-
-@pytest.mark.parametrize(
-    ("given", "selector"), [({}, "r-map"), ({"selector": "good-regions"}, "good-regions")]
-)
-def test_patches_are_chosen_by_whom_the_photo_names_else_by_the_services_own(
-    bench: Bench, given: dict[str, str], selector: str
-) -> None:
-    bench.work(bench.received(**given))
-
-    assert bench.sandbox.seen["select"]["selector"] == selector
 
 
 def test_time_is_limited_by_what_a_task_computes(bench: Bench) -> None:
@@ -344,10 +334,8 @@ def test_the_open_photo_of_a_pair_is_measured_beside_the_closed_one(bench: Bench
     assert names == [opened.public_id, closed.public_id]
 
 
-def test_a_lost_file_and_a_lost_or_foreign_photo_of_a_pair_are_told(
-    bench: Bench,
-) -> None:
-    theirs, lost = Steps(bench.store, "somebody else").receive().public_id, bench.received()
+def test_a_lost_file_and_a_lost_or_foreign_photo_of_a_pair_are_told(bench: Bench) -> None:
+    theirs, lost = Steps(bench.store, "somebody else").counted().public_id, bench.received()
     bench.storage.delete(lost.folder)
 
     for photo in (lost, *(bench.received(kind="pair", reference_id=key) for key in ("gone", theirs))):
@@ -463,27 +451,7 @@ def test_cancelling_in_a_task_ends_the_photo_and_nothing_counts(bench: Bench, ta
     assert ended.lens is None or (ended.lens.version, ended.lens.sample_count) == (0, 0)
 
 
-def test_work_of_an_old_epoch_changes_nothing(bench: Bench) -> None:
-    photo = bench.received()
-
-    def restart(arguments: dict[str, Any], folder: Path) -> Outcome:
-        bench.store.photos.change([photo.public_id], "local", {"aperture": 4.0})
-        return ok({"patches": [patch(0)], "rejected": [], "lateral": None})
-
-    bench.sandbox.answers["select"].insert(0, restart)
-    after_old, done = bench.work(photo), bench.work(photo, epoch=2)
-
-    assert (after_old.state, after_old.epoch) == ("received", 2)
-    assert (done.state, done.aperture, done.patches_total) == ("counted", 4.0, 2)
-
-
 # --- tries ------------------------------------------------------------------------------------
-
-
-def test_a_crash_is_tried_again(bench: Bench) -> None:
-    bench.let("develop", CRASHED, CRASHED, ok(7))
-
-    assert bench.attempt() == 7
 
 
 FULL = Outcome("memory_limit", code="memory_limit", detail="little")
@@ -500,6 +468,9 @@ FULL = Outcome("memory_limit", code="memory_limit", detail="little")
 def test_a_task_is_tried_as_often_as_that_may_help(
     bench: Bench, outcome: Outcome, code: str, says: str, memory_mb: list[int]
 ) -> None:
+    bench.let("develop", CRASHED, CRASHED, ok(7))
+    assert bench.attempt() == 7
+    bench.sandbox.limits.clear()
     bench.let("develop", outcome)
 
     with pytest.raises(JobFailedError, match=says) as caught:

@@ -167,16 +167,16 @@ def test_photos_are_read_while_others_are_in_work(
     crew: Crew, store: Store, sent: Callable[[int], None]
 ) -> None:
     def are_read() -> bool:
-        return all(row.width for row in store.photos.page("local", before=None, limit=12))
+        return all(row.width for row in store.photos.page("local", before=None, limit=8))
 
-    sent(12)
+    sent(8)
     crew.hire()
     crew.until(are_read)
     waiting = states(store).count("received")
     crew.until(lambda: are_counted(store))
 
     assert waiting > 0
-    check_counts(store, 12)
+    check_counts(store, 8)
 
 
 @SHORT_LEASE

@@ -22,6 +22,8 @@ from running import BRIEF, OWN_ACCOUNT, SMALL, Service, running, write_photo
 
 from lensmodel.photo import upright
 
+pytestmark = pytest.mark.tools  # a browser
+
 PATIENCE_MS = 120_000.0
 FLAGS = ["--headless=new", "--no-sandbox", "--no-first-run"]
 FLAGS += [
@@ -222,7 +224,11 @@ def test_photos_chosen_and_dropped_are_followed_on_the_page(page: Page, tmp_path
         expect(row.locator(".state")).to_contain_text("Used: blur measured")
         expect(row.locator("img")).not_to_have_js_property("naturalWidth", 0)
     expect(page.locator("#lenses .card")).to_have_count(1)
+    page.set_input_files("#files", chosen)
+    expect(page.locator("#uploads li")).to_contain_text("Already used: the same photo was sent before.")
     assert page.evaluate("window.first")  # gone if the page had been loaded again
+    page.get_by_role("link", name="Open it").click()
+    page.wait_for_url("**/photos/*")
 
 
 def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor, page: Page) -> None:
@@ -269,22 +275,6 @@ def test_a_tester_begins_with_a_lens_without_photos(page: Page, service: Service
     page.get_by_text("Send a test photo").click()
     expect(page.get_by_label("What it shows")).to_be_visible()
     assert service.http.delete(f"/v1/lenses/{page.url.split('/')[-2]}").status_code == 204
-
-
-def test_a_photo_sent_twice_is_used_already_and_the_focus_stays_where_a_button_was(
-    page: Page, service: Service, tmp_path: Path
-) -> None:
-    photo = small(tmp_path / "twice.dng", 3, "C-2")
-    sent = service.calibrated(photo)
-    page.goto("/")
-    page.set_input_files("#files", photo)
-
-    expect(page.locator("#uploads li")).to_contain_text("Already used: the same photo was sent before.")
-    page.get_by_role("link", name="Open it").click()
-    page.wait_for_url(f"**/photos/{sent['id']}")
-    press(page, "Do not use it for the lens")
-    expect(page.get_by_role("button", name="Use it again")).to_be_focused()
-    assert service.http.delete(f"/v1/photos/{sent['id']}").status_code == 204
 
 
 def test_a_button_waits_until_the_scripts_of_the_page_are_there(page: Page, learned: dict[str, Any]) -> None:
@@ -671,20 +661,6 @@ def test_a_page_says_when_the_service_is_away(visitor: Visitor, page: Page) -> N
     page.context.set_offline(False)
     expect(away).to_be_hidden()
     visitor.complaints.clear()  # the browser notes that it is offline
-
-
-def test_an_address_without_anything_is_a_page_for_people_and_json_for_programs(
-    visitor: Visitor, page: Page, service: Service
-) -> None:
-    for address in ("/photos/gone", "/lenses/gone", "/corrections/gone", "/nowhere"):
-        with page.expect_response(lambda answer: answer.status == 404):
-            page.goto(address)
-        expect(page.locator("h1")).to_have_text("Not here")
-    assert service.http.get("/photos/gone").json()["code"] == "unknown_photo"
-    assert service.http.get("/v1/photos/gone", headers={"Accept": "text/html"}).json()["status"] == 404
-
-    assert faults(page) == []
-    visitor.complaints.clear()  # the browser notes each 404
 
 
 @pytest.mark.parametrize("kind", ["home", "lens", "tests", "photo", "correction"])

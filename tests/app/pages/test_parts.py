@@ -481,6 +481,14 @@ def test_the_page_of_a_lens_shows_the_aperture_that_is_asked_for_and_no_empty_se
     assert client.get(f"/lenses/{lens}?aperture=wide").status_code == 422
 
 
+def test_an_address_without_anything_is_a_page_for_people_and_json_for_programs(client: TestClient) -> None:
+    for address in ("/photos/gone", "/lenses/gone", "/corrections/gone", "/nowhere"):
+        page = client.get(address, headers={"Accept": "text/html"})
+        assert (page.status_code, "<h1>Not here</h1>" in page.text) == (404, True), address
+    assert client.get("/photos/gone").json()["code"] == "unknown_photo"
+    assert client.get("/v1/photos/gone", headers={"Accept": "text/html"}).json()["status"] == 404
+
+
 # --- open pages ---------------------------------------------------------------------------------------
 
 

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from conftest import Steps
 from deadline import stretched
@@ -27,7 +26,6 @@ from app.store import LensName, Store
 from app.store.database import Database, current, head, upgrade
 from app.store.owners import ANY_OWNER, ensure_owner
 from app.store.tables import Base, EventRow, LensRow, PatchRow, PhotoRow, SampleRow
-from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
 
 OWNER = "local"
@@ -158,17 +156,6 @@ def test_a_correction_by_the_owner_goes_before_the_header(store: Store, steps: S
     assert (steps.fresh(photo).epoch, steps.fresh(photo).aperture) == (3, 2.0)
 
 
-def test_changing_a_counted_photo_renews_its_samples(store: Store, steps: Steps) -> None:
-    photo = steps.counted()
-
-    assert store.photos.change([photo.public_id], OWNER, {"aperture": 2.0})
-
-    after, (state, samples) = steps.fresh(photo), steps.learned(photo)
-    assert (after.state, after.epoch) == ("counted", photo.epoch)
-    assert (state.version, state.rebuild_epoch) == (2, 1)  # models in memory are told to forget the old ones
-    assert [sample.settings.aperture for sample in samples] == [2.0] * 6
-
-
 @pytest.mark.parametrize(("serial", "same"), [("123", True), ("124", False)])
 def test_photos_of_one_copy_share_a_lens_whatever_the_spelling(steps: Steps, serial: str, same: bool) -> None:
     first, second = steps.receive(), steps.receive(lens_maker="CANON", lens_model="ef24mm F/1.4l ")
@@ -207,16 +194,6 @@ def test_a_stored_photo_makes_no_lens_but_joins_one(steps: Steps) -> None:
 
 
 # --- samples and versions ---------------------------------------------------------------------
-
-
-def test_samples_come_back_as_they_were_written(steps: Steps) -> None:
-    photo = steps.counted()
-
-    state, samples = steps.learned(photo)
-
-    assert (state.version, state.rebuild_epoch, len(samples)) == (1, 0, 6)
-    assert (samples[0].settings.aperture, samples[0].photo) == (1.4, photo.public_id)
-    np.testing.assert_allclose(samples[0].kernel, gaussian(15, np.eye(2)), atol=1e-7)
 
 
 def test_deleting_a_photo_forgets_its_samples_and_names_its_blobs(store: Store, steps: Steps) -> None:

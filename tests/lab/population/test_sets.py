@@ -33,6 +33,7 @@ def lens(folder: Path) -> Lens:
     return lens_of(folder)
 
 
+@pytest.mark.slow
 def test_a_lens_is_the_same_whenever_it_is_made(folder: Path, lens: Lens) -> None:
     assert [len(Scenes(folder / "scenes", held_out=value)) for value in (False, True)] == [11, 1]
     again = lens_of(folder)
@@ -40,6 +41,7 @@ def test_a_lens_is_the_same_whenever_it_is_made(folder: Path, lens: Lens) -> Non
     np.testing.assert_array_equal(again.truth, lens.truth)
 
 
+@pytest.mark.slow
 def test_sets_hold_what_was_asked_for_and_survive_a_file(lens: Lens, tmp_path: Path) -> None:
     drawn = draw_set(lens, 6, 5, np.random.default_rng(0))
     assert len(drawn.xy) == 6
@@ -52,6 +54,7 @@ def test_sets_hold_what_was_asked_for_and_survive_a_file(lens: Lens, tmp_path: P
     np.testing.assert_allclose(back.query_xy, of_photos(lens, 1).query_xy[:: len(lens.xy) // 3])
 
 
+@pytest.mark.slow
 def test_other_photos_are_taken_through_the_same_lens_and_no_shard_is_made_twice(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,6 +126,7 @@ def test_a_traced_lens_is_photographed_at_several_apertures_and_focus_distances(
     assert all(states[0].focus_m == FAR_M for states in drawn)
 
 
+@pytest.mark.slow
 def test_samples_of_another_focus_distance_say_so(folder: Path) -> None:
     lens = lens_of(folder, "traced")
     assert len(np.unique(lens.settings[:, 3])) > 1

@@ -246,11 +246,10 @@ def test_a_homography_is_found_from_four_corners() -> None:
     assert homography_of(points, raised[:, :2] / raised[:, 2:]) == pytest.approx(truth, abs=1e-6)
 
 
-@pytest.mark.parametrize("shift", [(3, -5), (0, 11)])
-def test_a_match_says_how_far_the_photo_lies_beyond(shift: tuple[int, int]) -> None:
+def test_a_match_says_how_far_the_photo_lies_beyond() -> None:
     plane = np.random.default_rng(0).standard_normal((128, 128))
-    seen, _ = match(np.roll(plane, shift, (0, 1)), plane)
-    assert seen == pytest.approx(shift, abs=0.1)
+    seen, _ = match(np.roll(plane, (3, -5), (0, 1)), plane)
+    assert seen == pytest.approx((3, -5), abs=0.1)
 
 
 def test_a_psf_whose_error_is_not_known_is_left_out_and_the_others_stay() -> None:

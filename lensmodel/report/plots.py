@@ -14,12 +14,7 @@ import numpy as np
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Channel
-from lensmodel.report.lens_report import (
-    NYQUIST,
-    ApertureReport,
-    LensReport,
-    Unit,
-)
+from lensmodel.report.lens_report import NYQUIST, ApertureReport, LensReport, Unit
 
 try:
     import matplotlib as mpl

@@ -341,7 +341,19 @@ REFUSED = {
     "export by no format": (("export", PROFILE, "-o", "new.bmp"), 2, "ends in .fits, .json"),
     "half a place": (("export", PROFILE, "-o", "new.npz", "--phi", "1"), 2, "--phi needs --r"),
     "demo into a file": (("demo", "-o", "bad"), 2, "bad is a file"),
+    "finished benchmark": (("bench", "blind", "-o", "out"), 2, "blind.md is there already; --force replaces"),
+    "finished figures": (
+        ("reproduce", "--size", "quick", "-o", "out"),
+        2,
+        "reproduction.md is there already",
+    ),
+    "profile and auto": ((*CORRECT, "--lens", "auto", "-p", PROFILE), 2, "one of them"),
+    "neither profile nor auto": (CORRECT, 2, "--lens auto"),
 }
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -349,21 +361,22 @@ def test_refusal_is_one_sentence_with_the_value_and_a_remedy(
     case: str, folder: Path, made: Path, here: Here
 ) -> None:
     words, status, expected = REFUSED[case]
-    (folder / "empty").mkdir()
-    (folder / "sub").mkdir()
+    for name in ("empty", "sub", "out"):
+        (folder / name).mkdir()
+    for name in ("text.dng", "out/blind.md", "out/reproduction.md"):
+        (folder / name).write_text("no picture at all")
     shutil.copy(made / "other.dng", folder)
     shutil.copy(made / "other.dng", folder / "sub" / "one.dng")
-    (folder / "text.dng").write_text("no picture at all")
     (folder / "bad").write_bytes((folder / PROFILE).read_bytes()[:-200])
     (folder / "there.npy").write_bytes(b"mine")
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    before = contents(folder)
 
     done = here(*words)
 
     assert done.returncode == status, done.stderr
     assert re.search(expected, one_sentence(done.stderr)), done.stderr
     assert done.stdout == ""
-    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert contents(folder) == before
 
 
 def test_unknown_options_and_settings_are_wrong_usage(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -434,26 +447,6 @@ def test_demo_renews_what_an_earlier_demo_left_and_no_folder_of_others_unless_fo
 
     assert here("demo", "-o", "out", "--force").returncode == 0
     assert (folder / "out" / "mine.txt").read_text(encoding="utf-8") == "my notes"
-
-
-@pytest.mark.parametrize(
-    ("words", "finished"),
-    [
-        (("bench", "blind", "-o", "out"), "out/blind.md"),
-        (("reproduce", "--size", "quick", "-o", "out"), "out/reproduction.md"),
-    ],
-)
-def test_a_finished_report_is_refused_before_any_work(
-    words: tuple[str, ...], finished: str, folder: Path, here: Here
-) -> None:
-    (folder / "out").mkdir()
-    (folder / finished).write_text("finished", encoding="utf-8")
-
-    done = here(*words)
-
-    assert done.returncode == 2
-    assert f"{finished} is there already; --force replaces it" in one_sentence(done.stderr)
-    assert [path.name for path in (folder / "out").iterdir()] == [Path(finished).name]
 
 
 @pytest.mark.slow

@@ -167,14 +167,6 @@ def test_all_lenses_are_learned_before_photos_are_corrected(
     assert parts[-1][1][-1] == 100
 
 
-def test_a_profile_and_auto_exclude_each_other(card: Path) -> None:
-    both = lensmodel("correct", "holiday", "--lens", "auto", "-p", "x.lensprofile", cwd=card)
-    none = lensmodel("correct", "holiday", cwd=card)
-
-    assert (both.returncode, none.returncode) == (2, 2)
-    assert "--lens auto" in none.stderr
-
-
 @pytest.mark.slow
 def test_a_folder_of_an_unknown_lens_is_learned_and_corrected(tmp_path: Path) -> None:
     (tmp_path / "holiday").mkdir()

@@ -175,10 +175,7 @@ def test_beyond_the_outermost_square_of_a_chart_nothing_is_known() -> None:
     assert not unknown[radii < 0.65].any()
     for spot in found.map:  # not known to the 15 percent of what was measured
         if spot.tangential < 0.5:
-            low, high = (
-                spot.tangential * (1.0 - spot.predicted_error),
-                spot.tangential * (1.0 + spot.predicted_error),
-            )
+            low, high = spot.tangential * (1.0 + spot.predicted_error * np.array([-1.0, 1.0]))
             assert spot.tangential_range[0] <= max(low, 0.0) + 1e-9
             assert spot.tangential_range[1] >= min(high, 0.5) - 1e-9
     assert {row[1] for row in place_table(report)[1] if "(not known)" in row[1]} == {

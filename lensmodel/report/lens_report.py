@@ -18,6 +18,7 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import places_of
 from lensmodel.core.types import (
     ZONES,
@@ -319,8 +320,8 @@ def lens_report(
     """
     aspect = filled_aspect(model) if aspect is None else aspect
     cols = max(3, round(rows * aspect))
-    mapped = [("", at) for at in grid(rows, cols, aspect)]
     named = marked_places(aspect).items()
+    mapped = [("", at) for at in grid(rows, cols, aspect)]
     numbers = _chosen(model) if apertures is None else apertures
     wanted = [LensSettings(aperture=n) for n in numbers] or [LensSettings()]
     questions = [settings.with_channel(channel) for settings in wanted for channel in channels]
@@ -528,6 +529,8 @@ def compare(first: LensReport, second: LensReport) -> str:
 
 def half_sides(aspect: float) -> tuple[float, float]:
     """Half width and half height of a frame in half diagonals."""
+    if not 0.2 <= aspect <= 5.0:  # of a strip a map would have any number of columns
+        raise InvalidInputError(f"width over height must lie in 0.2..5, got {aspect}")
     diagonal = math.hypot(aspect, 1.0)
     return aspect / diagonal, 1.0 / diagonal
 

@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 from lab.kernels import gaussian
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import from_json, to_json
 from lensmodel.core.psf import PsfSample, delta
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Frame, LensSettings
@@ -332,7 +333,7 @@ def test_the_shape_of_a_picture_is_that_which_its_samples_fill(height: int, widt
     assert filled_aspect(LensModel.fit(middle, QUICK)) == 1.5  # nothing tells
 
 
-@pytest.mark.parametrize("aspect", [1.0, 16 / 9, 2 / 3, 6.0])
+@pytest.mark.parametrize("aspect", [1.0, 16 / 9, 2 / 3, 5.0])
 def test_marked_places_lie_on_the_picture_where_their_names_say(aspect: float) -> None:
     places = marked_places(aspect)
     assert len(places) == 9
@@ -343,6 +344,12 @@ def test_marked_places_lie_on_the_picture_where_their_names_say(aspect: float) -
             ("right" in name) - ("left" in name),
             ("upper" in name or "top" in name) - ("lower" in name or "bottom" in name),
         ]
+
+
+@pytest.mark.parametrize("aspect", [0.1, 3000.0])
+def test_a_strip_is_refused_before_its_map_is_made(aspect: float) -> None:
+    with pytest.raises(InvalidInputError, match="width over height"):
+        lens_report(LensModel.fit(samples(1), QUICK), "A lens", aspect=aspect)
 
 
 def test_angles_are_named_counter_clockwise_from_the_right() -> None:

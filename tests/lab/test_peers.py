@@ -57,14 +57,3 @@ def test_a_program_that_is_missing_or_does_not_end_is_named(
     for peer, said in ((missing, "no-such-program is not"), (sleeper, r"sleep did not end within 0\.2 s")):
         with pytest.raises(InvalidInputError, match=said):
             peer.run(Path("in.tif"), tmp_path, 1.0)
-
-
-def test_mosaic_for_raw_peers_keeps_each_colour_at_its_place(tmp_path: Path) -> None:
-    seen = np.zeros((16, 16, 3), dtype=np.float32)
-    seen[..., 0], seen[..., 1], seen[..., 2] = 0.25, 0.5, 0.75
-    raw = next(peer for peer in PEERS if peer.raw)
-
-    raw.write_input(seen, tmp_path / "in.dng")
-
-    numbers = np.frombuffer((tmp_path / "in.dng").read_bytes()[-16 * 16 * 2 :], dtype="<u2")
-    assert set(np.unique(numbers)) >= {round(0.25 * 65535), round(0.75 * 65535)}

@@ -82,20 +82,6 @@ def test_a_job_runs_once_however_often_it_is_asked_for(start: Start, ran: list[t
     assert ran == [("photo", "p1", "1"), ("photo", "p1", "2")]
 
 
-def test_a_failing_job_ends_and_is_not_repeated(start: Start) -> None:
-    calls = []
-
-    def photo(photo_id: str) -> None:
-        calls.append(photo_id)
-        raise RuntimeError("deliberate")
-
-    engine, job = start(photo=photo), Job("photo", ("p",))
-    engine.enqueue(job)
-    until(lambda: engine.status(job) == "done")
-
-    assert calls == ["p"]
-
-
 def test_photos_run_side_by_side_one_more_than_there_are_slots(start: Start) -> None:
     together, running, most = threading.Barrier(3, timeout=stretched(20)), set[int](), list[int]()
 

@@ -285,18 +285,6 @@ def test_a_button_waits_until_the_scripts_of_the_page_are_there(page: Page, lear
     expect(page.get_by_role("button", name="Delete photo")).to_be_disabled()
 
 
-def test_an_aperture_is_asked_for_where_it_is_missing(page: Page, service: Service, tmp_path: Path) -> None:
-    sent = waiting(service, small(tmp_path / "old.dng", 33, "", aperture=None))
-    page.goto("/")
-    group = page.locator(".group")
-
-    for given, hint in (("", "such as 2.8"), ("1000", "between 0.5 and 128"), ("wide", "must be a number")):
-        group.get_by_label("Aperture, f/").fill(given)
-        press(page, "Use the ticked photos")
-        expect(group.locator(".alert")).to_contain_text(hint)
-    assert service.http.delete(f"/v1/photos/{sent['id']}").status_code == 204
-
-
 def test_photos_that_wait_are_named_together_by_their_pictures(
     page: Page, service: Service, learned: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -136,19 +136,6 @@ def test_the_result_waits_for_the_work_until_cancelled(client: TestClient, store
     assert client.get(made["links"]["self"]).json()["error"]["code"] == "cancelled"
 
 
-def test_a_failed_correction_says_why_and_can_be_repeated(
-    client: TestClient, store: Store, photo: str
-) -> None:
-    made = post(client, photo_id=photo).json()
-    store.jobs.fail(made["id"], 1, "memory_limit", "needs 9 GiB, may have 4: correct a region")
-
-    shown = client.get(made["links"]["self"]).json()
-
-    assert (shown["state"], shown["error"]["code"]) == ("failed", "memory_limit")
-    assert client.get(f"/v1/corrections/{made['id']}/result").status_code == 409
-    assert post(client, photo_id=photo).json()["id"] != made["id"]
-
-
 def test_the_result_is_the_file_made_and_its_parts_join_to_the_whole(
     client: TestClient, finished: str
 ) -> None:

@@ -78,9 +78,7 @@ def test_a_port_that_is_taken_is_named() -> None:
             listen("127.0.0.1", port)
 
 
-def test_the_settings_of_the_compose_file_fit_together(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_settings_of_the_compose_file_fit_together(monkeypatch: pytest.MonkeyPatch) -> None:
     environment = OURS["api"]["environment"]
     for name, value in environment.items():
         monkeypatch.setenv(name, re.sub(r"\$\{[^}]+\}", "secret", value))

@@ -235,9 +235,7 @@ def reachable() -> Iterator[tuple[str, Path]]:
         pytest.skip("no interpreter that another account may use has the libraries")
 
 
-def test_another_account_keeps_a_task_from_all_files_and_processes(
-    reachable: tuple[str, Path],
-) -> None:
+def test_another_account_keeps_a_task_from_all_files_and_processes(reachable: tuple[str, Path]) -> None:
     program, data = reachable
     but = ("become another program",)  # it would
 

@@ -265,17 +265,10 @@ def test_a_deleted_lens_is_gone_and_its_photos_can_be_corrected_with_another(
     assert client.delete(address).status_code == 404
     states = [steps.fresh(photo).state for photo in (counted, running, waiting)]
     assert states == ["stored", "cancelled", "needs_lens"]
+    assert steps.estimate(running) == 0  # what still runs brings nothing back
+    assert store.photos.finish(running.public_id, 1) is None
     for table in (SampleRow, PatchRow, EventRow, LensRow):
         assert rows(store, table) == []
-
-
-def test_nothing_that_still_ran_brings_a_deleted_lens_back(store: Store, steps: Steps) -> None:
-    running = steps.planned()
-    store.lenses.delete(steps.lens_id(running), OWNER)
-
-    assert steps.estimate(running) == 0
-    assert store.photos.finish(running.public_id, 1) is None
-    assert lenses(store) == []
 
 
 def test_the_same_lens_begins_anew_with_its_next_photo(store: Store, steps: Steps) -> None:

@@ -121,9 +121,7 @@ class Oracle(Fake):
         return PsfEstimate(psf.as_kernel(off_centre), 0.5, 0.3)
 
 
-def test_error_ratio_of_the_true_kernel_is_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_error_ratio_of_the_true_kernel_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
     kernel = load_psfs()[3]
     monkeypatch.setattr(benchmark, "load_psfs", lambda: kernel[None])
     rows = [r for r in run(oracle=Oracle(kernel=tuple(map(tuple, kernel)))).results if r.method == "oracle"]
@@ -136,9 +134,7 @@ def test_error_ratio_of_the_true_kernel_is_one(
         assert row.improved
 
 
-def test_harm_is_told_from_declining_which_leaves_the_patch(
-    report: BlindReport,
-) -> None:
+def test_harm_is_told_from_declining_which_leaves_the_patch(report: BlindReport) -> None:
     wide = next(row for row in summarised(report.results) if row["method"] == "wide")
     left = [row for row in report.results if row.method in {benchmark.UNTOUCHED, "shy"}]
 

@@ -15,7 +15,7 @@ from scipy import ndimage, special
 import lensmodel
 from lab.gallery import page as shown_page
 from lab.gallery.figures import dots, grain, grain_ratio, hue_flips, overshoots, percentile_of_edges
-from lab.gallery.page import TILE, GalleryEntry, bars, entries_of, measured, places, sheet, text, write_page
+from lab.gallery.page import TILE, GalleryEntry, bars, entries_of, measured, places, text, write_page
 from lab.gallery.pictures import FRAMES, Picture, chosen, real_pictures, rendered, take
 from lab.images import gains
 from lab.kernels import gaussian
@@ -221,15 +221,6 @@ def test_gains_against_the_truth_are_those_of_the_errors_and_a_ruined_block_is_f
     assert ruined.loss_share > 0.0
 
 
-def test_a_shift_costs_nothing() -> None:
-    truth = leaves(160, 160)
-    moved = ndimage.shift(truth, (0.4, -1.3, 0.0), order=5, mode="nearest")
-
-    found = gains(blurred(truth, 0.7), moved, truth)
-    assert found is not None
-    assert found.worst_db > 5.0
-
-
 def stored(picture: Shown) -> NDArray[np.uint16]:
     return np.rint(np.clip(picture, 0.0, 1.0) * 65535).astype(np.uint16)
 
@@ -267,16 +258,6 @@ def test_the_most_changed_places_are_those_that_were_changed() -> None:
     row, col = found["most changed 1"]
     assert (340 - 96 <= row <= 300, 480 - 96 <= col <= 440) == (True, True)
     assert {"center", "upper left", "lower right"} <= set(found)
-
-
-def test_crops_are_squares_of_three_pixels_side_by_side() -> None:
-    picture = stored(even(40, 40))
-
-    made = sheet([picture, picture[::-1]], 10, 10, 8)
-
-    assert made.shape == (8 * shown_page.ZOOM, 2 * 8 * shown_page.ZOOM + 6, 3)
-    assert (made[:3, :3] == picture[10, 10] // 257).all()
-    assert (made[:3, -3:] == picture[::-1][10, 17] // 257).all()
 
 
 @pytest.fixture

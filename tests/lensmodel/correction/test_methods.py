@@ -20,7 +20,7 @@ from lensmodel.correction import (
     deconvolvers,
     restore_planes,
 )
-from lensmodel.correction.blur import Drift, UniformBlur
+from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.richardson_lucy import Acceleration, Lights, first_guess
 from lensmodel.correction.sparse_gradient import Shrinkage, shrink
 
@@ -197,15 +197,6 @@ def test_parameters_out_of_range_are_refused(method: type, wrong: dict, said: st
         method(**wrong)
 
 
-def test_weights_may_be_whole_numbers() -> None:
-    tile, blurs = np.stack([scene(40, 44)] * 3), [UniformBlur(gaussian(5, np.eye(2)))] * 3
-    whole, real = (
-        SparseGradient(weight=w).deconvolve_planes(tile, blurs, [CLEAN] * 3).planes for w in (2, 2.0)
-    )
-
-    np.testing.assert_array_equal(whole, real)
-
-
 def test_richardson_lucy_raises_the_likelihood_with_every_step() -> None:
     rng = np.random.default_rng(5)
     blur = UniformBlur(gaussian(9, np.eye(2) * 2))
@@ -289,26 +280,6 @@ def test_clipped_lights_do_not_ring_into_their_neighbours() -> None:
     assert rmse(with_lights[far], truth[far]) <= 1.1 * rmse(without[far], truth[far])
 
 
-@pytest.mark.parametrize("light", [1.5, 20.0])
-def test_standard_method_does_not_ring_around_clipped_lights(light: float) -> None:
-    rng = np.random.default_rng(8)
-    sharp = lit(scene(140, 140) * 0.5, light, (50, 60), (95, 88))
-    blur = UniformBlur(gaussian(17, np.eye(2) * 4))
-    truth = blur.frame(sharp)
-    photo = np.minimum(blur.forward(sharp), 1.0) + 1e-3 * rng.standard_normal((124, 124))
-    photo = photo.astype(np.float32)
-    dark = ~ndimage.binary_dilation(truth > 1.0, iterations=3)
-    far = ~ndimage.binary_dilation(photo > 0.98, iterations=8)
-    noise = NoiseModel(1e-5, 1e-6)
-
-    aware = SparseGradient().deconvolve(photo, blur, sensor=Sensor(noise, clip=0.98))
-    unaware = SparseGradient().deconvolve(photo, blur, sensor=Sensor(noise))
-
-    assert rmse(aware[dark], truth[dark]) < rmse(photo[dark], truth[dark])
-    assert rmse(aware[far], truth[far]) < 0.85 * rmse(photo[far], truth[far])
-    assert rmse(aware[dark], truth[dark]) < rmse(unaware[dark], truth[dark])
-
-
 @pytest.mark.parametrize("alpha", [0.5, 0.8, 1.0])
 @pytest.mark.parametrize("threshold", [1e-4, 0.01, 1.0])
 def test_shrinkage_finds_the_minimum_but_on_the_ramp_of_its_jump(alpha: float, threshold: float) -> None:
@@ -326,21 +297,6 @@ def test_shrinkage_finds_the_minimum_but_on_the_ramp_of_its_jump(alpha: float, t
     jump = np.abs(v) * shrinkage.prox[0] / scale
     excess = energy(found[:, None].astype(np.float64))[:, 0] - best - 2e-3 * threshold - 1e-5
     assert np.all(excess[(jump <= 1.0) | (jump >= 1.1)] <= 0.0)
-
-
-@pytest.mark.parametrize("surrounded", [False, True])
-def test_a_kernel_that_drifts_is_followed(surrounded: bool) -> None:
-    narrow, wide = (UniformBlur(gaussian(9, np.eye(2) * width)) for width in (0.8, 1.2))
-    blur = UniformBlur(
-        gaussian(9, np.eye(2)), drift=Drift((narrow, wide, 80.0), (wide, narrow, 90.0), (40.0, 45.0))
-    )
-    blurred = np.stack([blur.forward(scene(90, 101))[:80, :90]] * 3)
-    sensors = [Sensor(NoiseModel(1e-5, 1e-6), surrounded=surrounded)] * 3
-
-    moving = restore_planes(SparseGradient(), blurred, [blur] * 3, sensors).planes
-    steady = restore_planes(SparseGradient(), blurred, [UniformBlur(blur.kernel)] * 3, sensors).planes
-
-    assert rmse(moving, steady) > 1e-3
 
 
 def test_data_with_their_surroundings_give_the_same_picture_inside() -> None:
@@ -364,9 +320,3 @@ def test_a_frame_behind_a_point_moved_by_a_part_of_a_pixel_does_not_run_away() -
     restored = SparseGradient().deconvolve_planes(tile, blurs, [Sensor(NoiseModel.white(0.002))] * 3).planes
 
     assert np.abs(restored).max() < 100.0  # steps of the tile ring; without a bound nothing is a number
-
-
-def test_paper_takes_its_acceleration_as_a_parameter() -> None:
-    chosen = deconvolvers.create("paper", acceleration="adaptive", iterations=7)
-    assert (chosen.acceleration, chosen.iterations, chosen.warped) == ("adaptive", 7, True)  # type: ignore[attr-defined]
-    assert deconvolvers.create("paper").acceleration == "fixed"  # type: ignore[attr-defined]

@@ -187,19 +187,6 @@ def test_values_without_negatives_keep_their_sum_and_those_without_any_stay() ->
 # ---- the sum of eq. (4), its neighbours, its bandwidths
 
 
-def test_answer_is_the_sum_over_all_kernels_turned_by_formula() -> None:
-    narrow = fit(photos(20), "paper", r=0.05, phi=0.2)  # kernels reach no farther than the samples beside
-    points, scale = va.points(narrow.samples), va.scales(narrow.bandwidth)
-    for where in places(6, 3):
-        squared = va.squared_distances(points, va.point(where, GREEN), scale)
-        weight = np.exp(-0.5 * (squared - squared.min()))
-        turned = [truth(s.position, where.phi - s.position.phi) for s in narrow.samples]
-        brute = np.tensordot(weight / weight.sum(), np.array(turned), axes=1)
-        fast = narrow.query(where, GREEN, SIZE).kernel
-
-        assert np.abs(fast - brute).max() < 2e-3 * brute.max()
-
-
 def test_neighbours_in_the_tree_weigh_what_all_samples_would() -> None:
     rng = np.random.default_rng(6)
     colours = [GREEN.with_channel(CHANNELS[i % 3]) for i in range(300)]
@@ -317,19 +304,6 @@ def test_samples_added_one_by_one_answer_as_all_at_once() -> None:
         a, b = grown.query(where, GREEN, SIZE), at_once.query(where, GREEN, SIZE)
         assert difference(a.kernel, b.kernel) < 1e-6
         assert a.effective_samples == pytest.approx(b.effective_samples, rel=1e-6)
-
-
-def test_older_model_is_untouched_by_samples_added_later() -> None:
-    old = fit(photos(2), "paper")
-    before = kernel_at(old, 0.5, 0.5)
-    left, right = (
-        old.added([PsfSample(kernel, FieldPosition(0.5, 0.5), GREEN, photo="new")])
-        for kernel in (delta(SIZE), gaussian(SIZE, np.eye(2) * 6))
-    )
-
-    assert np.array_equal(kernel_at(old, 0.5, 0.5), before)
-    assert left.samples[-1].photo == "new"
-    assert kernel_at(left, 0.5, 0.5).max() > kernel_at(right, 0.5, 0.5).max()
 
 
 def test_a_sample_takes_25_bytes_a_pixel() -> None:

@@ -119,20 +119,19 @@ def usable(
     require_size(size)
     if len(patches) != len(noise) or not patches:
         raise InvalidInputError(f"every patch needs a noise model, got {len(patches)} and {len(noise)}")
-    kept, reasons = [], []
+    kept, reasons = [], set[str]()
     for patch, model in zip(patches, noise, strict=True):
         if patch.ndim != 2 or min(patch.shape) < _MIN_SIDE:
             raise InvalidInputError(f"a patch must be a plane of at least {_MIN_SIDE} px, got {patch.shape}")
         if not np.isfinite(patch).all():
             raise InvalidInputError("a patch must be finite; mask or replace NaN and infinity first")
-        reason = _unfit(patch, model)
-        if reason is None:
-            kept.append((patch, model))
+        if reason := _unfit(patch, model):
+            reasons.add(reason)
         else:
-            reasons.append(reason)
+            kept.append((patch, model))
     if not kept:
         raise NotEnoughEvidenceError(
-            f"no patch determines a kernel ({', '.join(sorted(set(reasons)))}); choose parts with fine detail"
+            f"no patch determines a kernel ({', '.join(sorted(reasons))}); choose parts with fine detail"
         )
     return kept
 

@@ -47,12 +47,8 @@ def resized(kernel: Kernel, size: int) -> Kernel:
     """Crop or zero-pad to another odd side, centre kept, renormalised."""
     if size < 1 or size % 2 == 0:
         raise InvalidInputError(f"size must be odd and positive, got {size}")
-    old = kernel.shape[0]
-    if size <= old:
-        cut = (old - size) // 2
-        return as_kernel(kernel[cut : cut + size, cut : cut + size])
-    pad = (size - old) // 2
-    return as_kernel(np.pad(kernel, pad))
+    cut = (kernel.shape[0] - size) // 2
+    return as_kernel(kernel[cut : cut + size, cut : cut + size] if cut >= 0 else np.pad(kernel, -cut))
 
 
 def centroid(kernel: npt.NDArray[np.float64]) -> tuple[float, float]:

@@ -73,26 +73,23 @@ def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[flo
     normalised cross-correlation of band-passed windows peaks. The radial part of the shifts is fitted by
     Huber-weighted least squares; the Bayesian information criterion chooses the number of terms, or none.
     """
-    full = 0.98 * np.broadcast_to(clip, 3)
-    radii: dict[int, list[float]] = {0: [], 2: []}
-    shifts: dict[int, list[float]] = {0: [], 2: []}
+    full, half = 0.98 * np.broadcast_to(clip, 3), _WINDOW // 2 + _SEARCH  # with a margin for the band-pass
+    found: dict[int, list[tuple[float, float]]] = {0: [], 2: []}  # radius and outward shift of red and blue
     for row, col in _points(planes[1], frame):
-        window = _cut(planes, row, col)
-        if window is None or (window.max(axis=(1, 2)) >= full).any():
+        window = planes[:, max(row - half, 0) : row + half, max(col - half, 0) : col + half]
+        if window.shape[1:] != (2 * half, 2 * half) or (window.max(axis=(1, 2)) >= full).any():
             continue
         # Same geometry as FieldPosition: u points outwards from the centre.
         position = frame.position(row, col)
         out = (-math.sin(position.phi), math.cos(position.phi))
         green = _banded(window[1])
-        for index in (0, 2):
+        for index, points in found.items():
             shift = _shift(_banded(window[index]), green)
             if shift is not None:
-                radii[index].append(position.r)
-                shifts[index].append(shift[0] * out[0] + shift[1] * out[1])
-    red, blue = (
-        _fit(np.array(radii[index]), np.array(shifts[index]), frame.half_diagonal) for index in (0, 2)
-    )
-    return LateralColour(red, blue, frame.half_diagonal, len(radii[0]), len(radii[2]))
+                points.append((position.r, shift[0] * out[0] + shift[1] * out[1]))
+    columns = (np.reshape(points, (-1, 2)).T for points in found.values())
+    red, blue = (_fit(r, shift, frame.half_diagonal) for r, shift in columns)
+    return LateralColour(red, blue, frame.half_diagonal, len(found[0]), len(found[2]))
 
 
 def resample(planes: Planes, frame: Frame, lateral: LateralColour) -> Planes:
@@ -142,14 +139,6 @@ def _points(green: Plane, frame: Frame) -> Iterator[tuple[int, int]]:
             strength = weaker[part][tuple(peaks.T)]
             for row, col in peaks[np.argsort(-strength, kind="stable")[:_POINTS]]:
                 yield int((top + row) * bin_by), int((left + col) * bin_by)
-
-
-def _cut(planes: Planes, row: int, col: int) -> Planes | None:
-    """Window around a point, with a margin for the band-pass; None where it leaves the frame."""
-    half = _WINDOW // 2 + _SEARCH
-    if min(row, col) < half or row + half > planes.shape[1] or col + half > planes.shape[2]:
-        return None
-    return np.asarray(planes[:, row - half : row + half, col - half : col + half], dtype=np.float32)
 
 
 def _banded(window: NDArray[np.float32]) -> NDArray[np.float64]:

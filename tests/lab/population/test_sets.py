@@ -114,6 +114,7 @@ def test_processing_keeps_a_flat_picture(kind: str) -> None:
     assert made.mean() == pytest.approx(0.25, abs=0.06)  # a tone curve may move it a little
 
 
+@pytest.mark.slow
 def test_a_traced_lens_is_photographed_at_several_apertures_and_focus_distances() -> None:
     drawn = [
         library.draw_states("traced", np.random.default_rng(seed), held_out=False) for seed in (5, 7, 11, 12)

@@ -189,6 +189,7 @@ class Bench:
 def bench(settings: Settings, steps: Steps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.setattr("app.jobs.context.BACKOFF_S", 0.001)
     monkeypatch.setattr("app.jobs.work.WAIT_S", 0.001)
+    monkeypatch.setattr("app.jobs.work.WAIT_FOR_REFERENCE_S", 0.01)
     sandbox: Any = Scripted(tmp_path / "scratch")
     return Bench(JobContext(settings, steps.store, Storage(settings.storage), sandbox), sandbox, steps)
 
@@ -335,7 +336,7 @@ def test_the_open_photo_of_a_pair_is_measured_beside_the_closed_one(bench: Bench
 
 
 def test_a_lost_file_and_a_lost_or_foreign_photo_of_a_pair_are_told(bench: Bench) -> None:
-    theirs, lost = Steps(bench.store, "somebody else").counted().public_id, bench.received()
+    theirs, lost = Steps(bench.store, "somebody else").receive().public_id, bench.received()
     bench.storage.delete(lost.folder)
 
     for photo in (lost, *(bench.received(kind="pair", reference_id=key) for key in ("gone", theirs))):

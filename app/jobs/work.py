@@ -277,8 +277,9 @@ class _Steps:
         if name is None:
             return []
         row, end = self._photos.get(name, ANY_OWNER), time.monotonic() + WAIT_FOR_REFERENCE_S
-        unread = ("received", "inspecting")
-        while row and not row.width and row.state in unread and time.monotonic() < end and self._wanted():
+        while row and row.owner_id == self._photo.owner_id and not row.width and self._wanted():
+            if row.state not in {"received", "inspecting"} or time.monotonic() > end:
+                break
             time.sleep(WAIT_S)
             row = self._photos.get(name, ANY_OWNER)
         if row is None or row.owner_id != self._photo.owner_id:

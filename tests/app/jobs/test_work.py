@@ -189,7 +189,6 @@ class Bench:
 def bench(settings: Settings, steps: Steps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.setattr("app.jobs.context.BACKOFF_S", 0.001)
     monkeypatch.setattr("app.jobs.work.WAIT_S", 0.001)
-    monkeypatch.setattr("app.jobs.work.WAIT_FOR_REFERENCE_S", 0.01)
     sandbox: Any = Scripted(tmp_path / "scratch")
     return Bench(JobContext(settings, steps.store, Storage(settings.storage), sandbox), sandbox, steps)
 

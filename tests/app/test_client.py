@@ -25,13 +25,9 @@ def api(client: TestClient) -> Client:
     return Client(http=client)
 
 
-def written(path: Path, content: bytes) -> Path:
-    path.write_bytes(content)
-    return path
-
-
 def test_an_upload_comes_back_as_a_photo(api: Client, tmp_path: Path) -> None:
-    path, far = written(tmp_path / "Größe p1.tif", b"II*\x00" + bytes(600_000)), list[tuple[int, int]]()
+    path, far = tmp_path / "Größe p1.tif", list[tuple[int, int]]()
+    path.write_bytes(b"II*\x00" + bytes(600_000))
 
     photo = api.upload(path, aperture=2.8, calibrate=False, on_progress=lambda *now: far.append(now))
 
@@ -42,22 +38,6 @@ def test_an_upload_comes_back_as_a_photo(api: Client, tmp_path: Path) -> None:
     assert api.photos() == [api.photo(photo.id)]
     api.delete(photo)
     assert api.photos() == []
-
-
-def test_waiting_ends_when_the_job_does(api: Client, steps: Steps, store: Store) -> None:
-    photo = steps.planned()
-    steps.estimate(photo)
-    states: list[str] = []
-
-    def finish_when_seen(seen: JobOut) -> None:
-        states.append(seen.state)
-        if seen.state == "running":
-            store.photos.finish(photo.public_id, 1)
-
-    job = api.wait(photo.public_id, timeout=20, on_change=finish_when_seen)
-
-    assert job.state == "succeeded"
-    assert states == ["running", "succeeded"]
 
 
 def test_waiting_for_a_failed_or_stuck_job_raises_why(api: Client, steps: Steps, store: Store) -> None:
@@ -190,8 +170,9 @@ def test_waiting_outlasts_a_restart_of_a_service_that_was_there(monkeypatch: pyt
     monkeypatch.setattr("app.client.AWAY_SECONDS", 0.0)
     away = httpx2.ConnectError("no")
     answers = [job_of("running"), away, *map(httpx2.Response, (502, 503)), job_of("succeeded"), away]
-    flaky = httpx2.MockTransport(mock.Mock(side_effect=answers))
+    flaky, seen = httpx2.MockTransport(mock.Mock(side_effect=answers)), list[JobOut]()
     with httpx2.Client(transport=flaky, base_url="http://x") as http:
-        assert Client(http=http).wait("1").state == "succeeded"
+        assert Client(http=http).wait("1", on_change=seen.append).state == "succeeded"
+        assert [job.state for job in seen] == ["running", "succeeded"]
         with pytest.raises(httpx2.ConnectError):
             Client(http=http).wait("1")

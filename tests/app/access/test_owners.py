@@ -371,22 +371,10 @@ def test_a_key_is_made_listed_and_ended(tmp_path: Path) -> None:
 
     states = [key["state"] for key in json.loads(run(tmp_path, "list", "--owner", "anna", "--json")[0])]
     assert states == ["revoked"]
-    assert "owner anna" in run(tmp_path, "list")[0]
-
-
-@pytest.mark.parametrize(
-    ("words", "error", "said"),
-    [
-        ("create --expires 3months", UsageError, "such as 90d; got '3months'"),
-        ("create --owner |", UsageError, "owner's name"),
-        ("revoke abcd2345", InvalidInputError, "no key begins with abcd2345"),
-    ],
-)
-def test_nonsense_is_refused_in_a_sentence(
-    tmp_path: Path, words: str, error: type[Exception], said: str
-) -> None:
-    with pytest.raises(error, match=said):
-        run(tmp_path, *words.split())
+    with pytest.raises(UsageError, match="such as 90d; got '3months'"):
+        run(tmp_path, "create", "--expires", "3months")
+    with pytest.raises(InvalidInputError, match="no key begins with abcd2345"):
+        run(tmp_path, "revoke", "abcd2345")
 
 
 def test_the_client_sends_its_key_or_that_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

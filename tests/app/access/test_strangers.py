@@ -127,12 +127,6 @@ def test_changes_asked_by_other_sites_are_refused(
     assert len(client.get("/v1/photos", headers=headers).json()["items"]) == 1
 
 
-def test_our_own_pages_and_programs_may_change_things(client: TestClient) -> None:
-    ours = {"Origin": "http://testserver", "Sec-Fetch-Site": "same-origin"}
-    for headers in ({}, ours, {"Sec-Fetch-Site": "none"}):
-        assert client.post("/v1/photos", content=TIFF, headers=headers).status_code in {200, 202}
-
-
 def test_every_route_that_changes_something_asks_where_it_comes_from(client: TestClient) -> None:
     described = client.get("/openapi.json").json()["paths"].items()
     changing = [(method, path) for path, methods in described for method in methods if method != "get"]

@@ -71,16 +71,6 @@ def test_a_record_is_one_object_on_one_line_whatever_it_holds(said: Said) -> Non
     assert record["time"].endswith("Z")
 
 
-def test_a_line_of_a_job_names_the_job_and_its_photo(said: Said) -> None:
-    durable("photo", lambda *_: logging.getLogger("app.jobs").info("at work"), print)("PHOTO", 1)
-    logging.getLogger("app.jobs").info("at rest")
-
-    during, after = said("app.jobs")
-
-    assert (during["job_id"], during["photo_id"]) == ("photo/PHOTO/1", "PHOTO")
-    assert "job_id" not in after
-
-
 TEXT = "at work\nINFO forged\x1b[2J\r\u2028y"
 
 

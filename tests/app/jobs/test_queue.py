@@ -12,7 +12,6 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -100,12 +99,6 @@ def test_photos_run_side_by_side_one_more_than_there_are_slots(start: Start) -> 
     assert (together.broken, max(most)) == (False, 3)
 
 
-def test_the_engines_file_is_in_wal_mode(start: Start, tmp_path: Path) -> None:
-    start()
-    with closing(sqlite3.connect(tmp_path / "jobs.db")) as connection:
-        assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
-
-
 def test_forgotten_jobs_leave_no_row(start: Start) -> None:
     engine, job = start(), Job("measure", ("lens", 3))
     engine.enqueue(job)
@@ -176,19 +169,14 @@ def sqlite_error(code: int) -> exc.OperationalError:
     ("error", "is_so"),
     [
         (AWAY, True),
-        (exc.InterfaceError("SELECT", {}, psycopg.InterfaceError("the connection is lost")), True),
         (exc.TimeoutError("no connection within 30 s"), True),
-        (sqlite_error(sqlite3.SQLITE_BUSY), True),
         (sqlite_error(sqlite3.SQLITE_FULL), True),
-        (stored.GenericError("error sending request"), True),
         (stored.PermissionDeniedError("credentials are being changed"), True),
         (OSError(errno.ENOSPC, "no space"), True),
-        (ConnectionRefusedError(), True),
         (MemoryError(), True),
         (ValueError("of ours"), False),
         (FileNotFoundError(errno.ENOENT, "gone"), False),
         (stored.InvalidPathError("of ours"), False),
-        (exc.IntegrityError("INSERT", {}, Exception("of ours")), False),
         (sqlite_error(sqlite3.SQLITE_ERROR), False),
     ],
 )

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
-import numpy as np
 import pytest
 
-from lab.kernels import gaussian
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import Camera, LensModel, LensProfile, load_profile, save_profile
+from lensmodel.model import Camera
 from lensmodel.model.profile import Identity, difference
 
 CANON = {"maker": "Canon", "model": "EF24mm f/1.4L II USM", "serial": "ab-1"}
@@ -22,7 +17,7 @@ PHONE = {"maker": "Apple", "model": "iPhone 6 back camera 4.15mm f/2.2"}
 EOS = Camera("Canon", "Canon EOS 5D", "0123")
 OTHER_EOS = Camera("Canon", "Canon EOS 5D", "77")
 COMPACT = Camera("EASTMAN KODAK COMPANY", "KODAK Z612 ZOOM DIGITAL CAMERA", None)
-KODAK, SPELT = Camera(None, "Kodak Z612"), Camera("Eastman", "KODAK Z612")
+KODAK = Camera(None, "Kodak Z612")
 IPHONE, IPHONE_A, IPHONE_B = (Camera("Apple", "iPhone 6", serial) for serial in (None, "A", "B"))
 
 SAYS_NOTHING, EF35_ON_EOS = Identity(), Identity({"model": "EF35mm f/2"}, [EOS])
@@ -44,12 +39,8 @@ def test_a_lens_is_known_however_a_program_writes_its_name() -> None:
         (CANON_ON_EOS, Identity({"maker": "Canon"}, [Camera("Canon", "EOS 5D", "77")])),
         (Identity(CANON), OF_COMPACT),  # a profile need not say its camera
         (CANON_ON_EOS, SAYS_NOTHING),  # as a scan
-        (OF_COMPACT, OF_COMPACT),
-        (OF_COMPACT, SAYS_NOTHING),
         (Identity(LABELLED, [EOS]), Identity({"model": "50mm"}, [EOS])),
-        (Identity(PHONE, [IPHONE_A]), Identity(PHONE, [IPHONE_A])),
         (Identity(PHONE, [IPHONE]), Identity(PHONE, [IPHONE_A])),
-        (Identity({}, [KODAK], [5.85]), Identity({}, [SPELT], [5.9])),
         (Identity({}, [KODAK], [5.85]), Identity({}, [KODAK], [23.4])),  # a compact that zooms
         (Identity(ACME, [EOS], [42.0]), Identity({"model": "acme-42mm"}, [COMPACT], [42.0])),
         (Identity(CANON, [EOS], [24.0]), Identity(CANON, [EOS], [70.0])),  # a zoom that names itself
@@ -68,27 +59,14 @@ def test_nothing_speaks_against_one_lens(known: Identity, seen: Identity) -> Non
         (Identity(ACME), Identity(ACME | {"serial": "2"}), "number is 2, that of the lens 1"),
         (Identity(ACME), Identity({"maker": "Other", "model": "Acme 42mm"}), "a lens of Other"),
         (CANON_ON_EOS, OF_COMPACT, "taken with another camera, KODAK"),
-        (OF_COMPACT, OF_EOS, "taken with another camera, Canon EOS 5D"),
         (OF_COMPACT, CANON_ON_EOS, "names its lens, EF24mm f/1.4L II USM ab-1, and .* none"),
         (Identity(focals_mm=[24.0]), Identity(CANON), "names its lens"),
-        (OF_EOS, EF35_ON_EOS, "names its lens"),
         (Identity(LABELLED, [EOS]), Identity({"model": "50mm"}, [COMPACT]), "another camera, KODAK"),
         (OF_EOS, Identity({}, [OTHER_EOS]), "another copy of the camera"),
         (Identity(PHONE, [IPHONE_A]), Identity(PHONE, [IPHONE_B]), "another copy of the camera"),
         (Identity(focals_mm=[16.0, 35.0]), Identity(focals_mm=[70.0]), "70 mm, and .* of 16 to 35 mm"),
-        (Identity({}, [EOS], [50.0]), Identity({}, [EOS], [24.0]), "24 mm, and .* of 50 mm"),
         (Identity(CANON, [EOS], [24.0]), Identity({}, [EOS], [50.0]), "50 mm, and .* of 24 mm"),
     ],
 )
 def test_another_lens_is_told(known: Identity, seen: Identity, why: str) -> None:
     assert re.match(f"its? .*{why}", difference(known, seen) or "")
-
-
-def test_a_profile_remembers_its_cameras(tmp_path: Path) -> None:
-    places = [FieldPosition(r, phi) for r in (0.1, 0.5, 0.9) for phi in (-2.0, 0.5, 2.5)]
-    settings, kernel = LensSettings(2.8), gaussian(15, np.eye(2))
-    model = LensModel.fit([PsfSample(kernel, place, settings, photo="x") for place in places])
-    path = tmp_path / "a.lensprofile"
-    save_profile(path, LensProfile(model, {}, {"x": "x.jpg"}, (EOS, COMPACT)))
-
-    assert load_profile(path).cameras == (EOS, COMPACT)

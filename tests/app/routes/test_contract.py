@@ -12,10 +12,9 @@ from unittest import mock
 from urllib.parse import quote
 
 import pytest
-from obstore.exceptions import GenericError
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
-from states import TIFF, Steps, finish, refusal, services_of
+from states import Steps, finish, refusal, services_of
 
 from app.http.errors import STATUS_OF_CODE, status_of
 from app.main import create_app
@@ -95,7 +94,6 @@ NEW = {"label": "mine"}
 CHANGES: list[object] = [
     *({}, [], {"colour": "red"}, {"lens_id": "a", "lens_serial": "b"}, {"lens_model": "EF"}),
     *({"aperture": bad} for bad in (0.1, "wide", True)),
-    *({"focal_length_mm": False}, {"focus_distance_m": True}),
     *({"new_lens": {"label": ""}}, {"lens_serial": "\x07"}),
 ]
 WISHES: list[dict[str, Any]] = [
@@ -103,9 +101,6 @@ WISHES: list[dict[str, Any]] = [
     *({"halo": -0.1}, {"halo": "NaN"}, {"denoise": 1.5}, {"lens_version": 0}, {"lens_version": 10**20}),
     *({"output": bad} for bad in ({"format": "bmp"}, {"quality": 0}, {"color_space": "adobe"})),
     {"roi": {"x": 0, "y": 0, "width": 6001, "height": 10}},
-    {"roi": {"x": -1, "y": 0, "width": 10, "height": 10}},
-    {"roi": {"x": 0, "y": 0, "width": 0, "height": 10}},
-    *({"photo_id": 7}, {"photo_id": "../../x"}),
 ]
 PAGES = ("limit=0", "limit=201", "limit=x", f"cursor={'x' * 50}")
 QUERIES = [
@@ -113,7 +108,6 @@ QUERIES = [
     *(f"/lenses/LENS/field.png?grid={grid}" for grid in ("0x3", "26x1", "axb", "9", "-1x2")),
     "/lenses/LENS/field.png?grid=25x25&size=255&aperture=1.4",
     *(f"/jobs/PHOTO?wait={wait}" for wait in ("-1", "21", "nan", "soon")),
-    f"/lenses/LENS/psf?r=0&version={10**20}",
     f"/lenses/LENS/calibrations?cursor={10**20}",
     *("/lenses/LENS/psf.exe?r=0", "/photos?state=lost"),
 ]
@@ -128,15 +122,10 @@ REFUSED: list[tuple[str, str, Any, int, str]] = [
     ("PATCH", "/v1/photos", {"photo_ids": ["PHOTO"], "lens_id": "x", "new_lens": NEW}, 422, INVALID),
     ("PATCH", "/v1/photos", {"photo_ids": ["gone"], "lens_id": "LENS"}, 404, "unknown_photo"),
     ("PATCH", "/v1/photos", {"photo_ids": ["PHOTO"], "lens_id": "gone"}, 404, "unknown_lens"),
-    ("PATCH", "/v1/lenses/LENS", {}, 422, INVALID),
     ("PATCH", "/v1/lenses/LENS", {"merge_into": "LENS"}, 422, INVALID),
-    ("POST", "/v1/lenses", {"label": ""}, 422, INVALID),
     *(("GET", f"/v1{query}", None, 422, INVALID) for query in QUERIES),
-    ("GET", "/v1/lenses/gone/report.json", None, 404, "unknown_lens"),
-    ("GET", "/nothing", None, 404, "not_found"),
     ("GET", "/v1/nothing", None, 404, "not_found"),
     ("PUT", "/v1/photos", None, 405, "method_not_allowed"),
-    ("PUT", "/v1/lenses", None, 405, "method_not_allowed"),
 ]
 
 
@@ -150,8 +139,6 @@ def test_what_makes_no_sense_is_refused_with_a_problem(client: TestClient, fille
         assert answer.headers["content-type"] == "application/problem+json", case
         assert {"type", "title", "status", "detail", "errors", "request_id"} <= set(problem), case
         assert problem["detail"], case
-        assert body != {"photo_id": "PHOTO", "method": "magic"} or "standard" in problem["detail"]
-        assert "25x25" not in path or "40.6 million pixels" in problem["detail"]
 
 
 @pytest.mark.parametrize(
@@ -236,23 +223,6 @@ def test_our_own_fault_and_a_locked_database_are_problems_without_their_cause(
     assert answer.headers["x-content-type-options"] == "nosniff"
     assert answer.headers.get("retry-after") == retry
     assert answer.json()["request_id"] == answer.headers["x-request-id"] == "abc-1"
-
-
-@pytest.mark.parametrize(
-    ("said", "told"),
-    [
-        ("Generic LocalFileSystem error: No space left on device (os error 28)", (507, "quota_exceeded")),
-        ("Generic S3 error: 503 Service Unavailable", (503, "busy")),
-    ],
-)
-def test_a_storage_that_is_full_or_away_is_told_so(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch, said: str, told: tuple[int, str]
-) -> None:
-    broken = mock.Mock(side_effect=GenericError(said))
-    monkeypatch.setattr(services_of(client).storage, "writer", broken)
-
-    assert refusal(client.post("/v1/photos", content=TIFF)) == told
-    assert client.get("/v1/photos").json()["items"] == []
 
 
 def test_a_name_that_a_stranger_may_own_is_not_served(client: TestClient) -> None:

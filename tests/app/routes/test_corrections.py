@@ -17,8 +17,6 @@ from app.store import Store
 from app.store.owners import ANY_OWNER, now
 from app.store.tables import OwnerRow
 
-GAIN = {"zones": {"corner": {"expected_gain_db": 2.0}}}
-
 
 def post(client: TestClient, **wish: Any) -> Any:
     return client.post("/v1/corrections", json=wish)
@@ -49,17 +47,6 @@ def test_a_correction_is_queued_with_the_newest_version(client: TestClient, step
     assert answer.headers["location"] == made["links"]["self"] == itself
     job = client.get(made["links"]["job"]).json()
     assert (job["kind"], job["state"], job["links"]["correction"]) == ("correction", "queued", itself)
-
-
-def test_the_same_wish_is_the_same_correction(client: TestClient, photo: str) -> None:
-    first, again = (post(client, photo_id=photo, strength=0.5) for _ in range(2))
-    finish(client, first.json()["id"], report=GAIN)
-    third = post(client, photo_id=photo, strength=0.5)
-    other = post(client, photo_id=photo, strength=0.6)
-
-    assert [answer.status_code for answer in (first, again, third, other)] == [202, 202, 200, 202]
-    assert first.json()["id"] == again.json()["id"] == third.json()["id"] != other.json()["id"]
-    assert third.json()["report"] == GAIN
 
 
 def test_bounds_and_a_new_photo_of_the_lens_make_other_corrections(

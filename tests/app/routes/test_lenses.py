@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import shutil
 import zipfile
 from dataclasses import replace
 from typing import Any
@@ -13,9 +12,9 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
-from sqlalchemy import event, update
+from sqlalchemy import update
 from starlette.testclient import TestClient
-from states import Steps, refusal, services_of, store_report
+from states import Steps, refusal, store_report
 
 from app.http import model_cache
 from app.http.model_cache import ModelCache
@@ -55,18 +54,6 @@ def test_a_lens_tells_who_it_is_and_what_it_knows(client: TestClient, lens: str)
     assert "123" not in str(shown["links"]).replace(shown["id"], "")
 
 
-def test_lenses_are_found_by_model_and_serial(client: TestClient, steps: Steps) -> None:
-    first, second = (steps.lens_id(steps.counted(serial=serial)) for serial in "12")
-
-    for query, found in {
-        "model=ef24MM f/1.4l": [second, first],
-        "model=EF24mm f/1.4L&serial=2": [second],
-        "serial=3": [],
-        "model=&serial=": [second, first],  # blank asks for all
-    }.items():
-        assert [lens["id"] for lens in client.get(f"/v1/lenses?{query}").json()["items"]] == found, query
-
-
 def test_a_psf_is_a_normalised_centred_kernel(client: TestClient, lens: str) -> None:
     answer, once_round = ask(client, lens), ask(client, lens, phi=0.59 + 2 * math.pi)
 
@@ -77,12 +64,8 @@ def test_a_psf_is_a_normalised_centred_kernel(client: TestClient, lens: str) -> 
     assert kernel.min() >= 0
     assert kernel.sum() == pytest.approx(1, abs=1e-6)
     assert np.abs(centroid(kernel)).max() < 0.05
-    asked = {"r": 0.9, "phi": 0.59, "aperture": 1.4, "channel": "g", "size": 55}
-    assert asked.items() <= answer["query"].items()
-    assert (answer["version"], answer["support"]["photos"]) == (1, 1)
     assert answer["support"]["effective_samples"] > 0
     assert set(answer["bandwidth"]) >= {"r", "phi"}
-    assert answer["units"] == {"r": "half-diagonal", "phi": "radian", "pixel_pitch_um": 6.0}
 
 
 def test_all_formats_hold_the_same_kernel(client: TestClient, lens: str) -> None:
@@ -105,9 +88,7 @@ def test_all_formats_hold_the_same_kernel(client: TestClient, lens: str) -> None
 
 def test_the_format_follows_what_the_caller_likes_best(client: TestClient, lens: str) -> None:
     for accept, form in {
-        "*/*": "json",
         "application/json": "json",
-        "image/png": "png",
         "image/tiff;q=0.5, image/png;q=0.2": "tiff",
         "text/html, image/*;q=0.8": "png",
         "application/x-npy": "npy",
@@ -174,11 +155,8 @@ BAD_QUESTIONS = {
     "aperture": ("0.49", "128.5", "nan"),
     "channel": ("x",),
     "size": ("0", "1", "54", "257", "5.5"),
-    "focal_length_mm": ("0",),
     "focus_distance_m": ("-2", "5e-324"),
     "pixel_pitch_um": ("5e-324",),
-    "version": ("0",),
-    "strict": ("maybe",),
     "wavelength": ("540",),
 }
 
@@ -206,7 +184,8 @@ def test_a_lens_without_samples_says_what_to_do(client: TestClient, steps: Steps
 
 
 def test_a_strict_question_outside_the_samples_is_refused(client: TestClient, lens: str) -> None:
-    assert ask(client, lens, aperture=128)["support"]["extrapolated"]
+    support = ask(client, lens, aperture=128)["support"]
+    assert (support["extrapolated"], support["beyond"]) == (True, ["aperture_stops"])
     strict = client.get(f"{lens}/psf?r=0.9&phi=0.59&aperture=128&strict=true")
     assert refusal(strict) == (422, "outside_support")
 
@@ -263,15 +242,6 @@ def taken(steps: Steps, pitch_um: float = 6.0, width: int = 6000, sigma_px: floa
     return f"/v1/lenses/{steps.lens_id(steps.counted(patches=6, width=sigma_px**2, size=25, body=body))}"
 
 
-def test_an_answer_says_what_made_it_and_what_is_beyond_all_photos(client: TestClient, steps: Steps) -> None:
-    lens = taken(steps)
-    near, far = (ask(client, lens, **of)["support"] for of in ({"r": 0.5}, {"r": 0.5, "aperture": 16}))
-
-    assert (near["answered_by"], near["weights"], near["beyond"]) == ("regression", "", [])
-    assert 0.0 < near["nearest"] < 2.5
-    assert far["beyond"] == ["aperture_stops"]
-
-
 def test_bodies_of_different_pitch_share_a_lens(client: TestClient, steps: Steps) -> None:
     lens = taken(steps)
     assert taken(steps) == lens
@@ -287,23 +257,6 @@ def test_bodies_of_different_pitch_share_a_lens(client: TestClient, steps: Steps
     assert usual["psf"] == coarse["psf"]
     assert fine["support"]["photos"] == 3
     assert client.get(f"{lens}/psf", params={"r": 0.5, "pixel_pitch_um": -1}).status_code == 422
-
-
-def test_warm_answers_cost_one_read_of_the_tables(client: TestClient, steps: Steps) -> None:
-    lens = taken(steps)
-    services = services_of(client)
-    ask(client, lens)
-    services.models.get(lens.rpartition("/")[2])
-    statements: list[str] = []
-
-    def note(*arguments: Any) -> None:
-        statements.append(str(arguments[2]))
-
-    event.listen(services.store.database.reader, "before_cursor_execute", note)
-    shutil.rmtree(services.storage.folder)  # it takes no blob, wherever these are
-    ask(client, lens, r=0.7)
-
-    assert len([text for text in statements if "SELECT" in text]) == 1
 
 
 def test_samples_of_an_old_format_ask_for_calibration(client: TestClient, store: Store, steps: Steps) -> None:
@@ -388,11 +341,9 @@ D750, BODY = Camera("NIKON CORPORATION", "NIKON D750", "1"), Camera("Leica", "M8
     ("lens_is", "cameras", "name"),
     [
         ({"label": "Grandfather's", "maker": "Zeiss", "model": "Biotar"}, (D750,), "Grandfather's"),
-        ({"maker": "Canon", "model": "EF24mm f/1.4L"}, (D750,), "Canon EF24mm f/1.4L"),
         ({"serial": "77"}, (D750, replace(D750, serial="2")), "Nikon D750, 24 mm"),
         ({}, (D750, BODY), "file"),
         ({}, tuple(Camera("Leica", f"M{k}") for k in range(101)), "file"),
-        ({}, (), "file"),
         ({"label": "two\nlines"}, (), "file"),
     ],
 )
@@ -457,11 +408,5 @@ def test_a_report_comes_in_each_form_and_on_its_page(client: TestClient, steps: 
         tag = {"If-None-Match": answer.headers["etag"]}
         assert answer.content.startswith(begins), answer.text
         assert client.get(f"/v1/lenses/{lens}/report.{form}", headers=tag).status_code == 304
-    details = client.get(f"/v1/lenses/{lens}/report.json").json()["details"]
-    assert details["Photos"].endswith(".dng")
-    assert details["Written"].startswith("20")
-
-    assert 'alt="MTF50 in cycles/pixel' in client.get(f"/lenses/{lens}/tests").text
     charts = f"/ui/lenses/{lens}/charts"
-    assert "MTF50 in line pairs per mm" in client.get(f"{charts}?unit=lp/mm&aperture=1.4").text
     assert [client.get(f"{charts}?aperture={wrong}").status_code for wrong in ("..", "x")] == [422, 422]

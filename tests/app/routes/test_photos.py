@@ -25,7 +25,6 @@ from app.runtime.settings import Settings
 from app.schemas import JobOut
 from app.store import Store
 from app.store.owners import ANY_OWNER
-from app.store.photos import Photos
 from lab.kernels import gaussian
 from lensmodel.blind import sampling
 from lensmodel.core.psf import PsfSample
@@ -76,15 +75,11 @@ def test_a_counted_photo_shows_its_lens_and_patches_and_no_serial(client: TestCl
     assert told == [("done", None), ("done", None), ("rejected", "flat")]
 
 
-def test_photos_are_listed_by_lens_and_state(client: TestClient, steps: Steps) -> None:
-    counted, other = steps.counted(serial="1"), steps.counted(serial="2")
+def test_photos_are_listed_by_state(client: TestClient, steps: Steps) -> None:
+    counted = steps.counted()
     steps.receive()
 
-    by_lens = get(client, f"photos?lens_id={steps.lens_id(counted)}")["items"]
-    by_state = get(client, "photos?state=counted")["items"]
-
-    assert [photo["id"] for photo in by_lens] == [counted.public_id]
-    assert [photo["id"] for photo in by_state] == [other.public_id, counted.public_id]
+    assert [photo["id"] for photo in get(client, "photos?state=counted")["items"]] == [counted.public_id]
 
 
 def test_excluding_a_photo_takes_it_out_of_the_lens_and_back(client: TestClient, steps: Steps) -> None:
@@ -140,22 +135,6 @@ def test_a_photo_waits_for_its_lens_and_starts_again(client: TestClient, steps: 
     assert (steps.lens_id(photo) == known) == (way != "new_lens")
 
 
-def test_photos_are_named_together(client: TestClient, steps: Steps) -> None:
-    photos = [steps.waiting(aperture=None) for _ in range(2)]
-    named = {
-        "photo_ids": [photo.public_id for photo in photos],
-        "new_lens": {"label": "Mine"},
-        "aperture": 2.0,
-    }
-
-    items = client.patch("/v1/photos", json=named).json()["items"]
-
-    rows = [steps.fresh(photo) for photo in photos]
-    assert [item["state"] for item in items] == ["received"] * 2
-    assert len({row.given["lens_id"] for row in rows}) == 1
-    assert [row.given["aperture"] for row in rows] == [2.0] * 2
-
-
 def test_a_change_happens_wholly_or_not_at_all(client: TestClient, steps: Steps, store: Store) -> None:
     photo = steps.receive()
     store.photos.fail(photo.public_id, 1, "no_usable_patches", "all is sky")
@@ -190,16 +169,6 @@ def test_deleting_a_photo_deletes_file_samples_and_job(client: TestClient, setti
     assert [client.get(f"/v1/{kind}/{photo}").status_code for kind in ("photos", "jobs")] == [404, 404]
     assert list((settings.data_dir / "blobs" / "photos").iterdir()) == []
     assert client.post("/v1/photos", content=TIFF).status_code == 202
-
-
-def test_a_photo_that_is_deleted_while_it_is_sent_is_told_as_it_was_received(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Photos, "get", lambda *_: None)
-
-    answer = client.post("/v1/photos", content=TIFF)
-
-    assert (answer.status_code, answer.json()["state"]) == (202, "received")
 
 
 def test_a_job_tells_how_far_it_is(client: TestClient, steps: Steps) -> None:
@@ -341,6 +310,7 @@ def test_a_measurement_is_sent_to_its_lens(client: TestClient, steps: Steps, sto
         ({"kind": "pair"}, "reference_id"),
         ({"kind": "target", "reference_id": "abc"}, "reference_id"),
         ({"kind": "target", "calibrate": "false"}, "exclude"),
+        ({"kind": "target", "selector": "good-regions"}, "leave one out"),
         ({"kind": "tarot"}, "kind"),
     ],
 )
@@ -357,5 +327,6 @@ def test_a_measurement_of_an_unknown_lens_or_reference_is_a_404(client: TestClie
     for path, code in (
         ("lenses/nobody/measurements?kind=target", "unknown_lens"),
         ("photos?kind=pair&reference_id=nobody", "unknown_photo"),
+        ("photos?lens_id=nothing", "unknown_lens"),
     ):
         assert refusal(client.post(f"/v1/{path}", content=PNG)) == (404, code)

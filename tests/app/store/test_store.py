@@ -110,15 +110,6 @@ def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> Non
     assert (steps.fresh(photo).state, steps.fresh(photo).lateral) == ("received", None)
 
 
-def test_a_photo_taken_up_again_keeps_the_time_since_its_stage_began(store: Store, steps: Steps) -> None:
-    photo = steps.planned()
-    since = steps.fresh(photo).stage_at
-
-    store.photos.set_state(photo.public_id, ("estimating",), "estimating")
-
-    assert steps.fresh(photo).stage_at == since
-
-
 def test_a_failed_photo_starts_anew_when_it_is_sent_again(store: Store, steps: Steps) -> None:
     photo = steps.receive()
     store.photos.fail(photo.public_id, 1, "no_usable_patches", "flat")
@@ -133,19 +124,13 @@ def test_a_failed_photo_starts_anew_when_it_is_sent_again(store: Store, steps: S
 # --- what files and owners say ----------------------------------------------------------------
 
 
-def test_what_the_header_says_goes_before_what_came_with_the_file(steps: Steps) -> None:
-    said, silent = steps.receive(aperture=2.8), steps.receive(aperture=2.8)
-
-    steps.inspect(said, aperture=1.4)
-    steps.inspect(silent, aperture=None)
-
-    assert (said.aperture, silent.aperture) == (2.8, 2.8)  # all that is known when the file has arrived
-    assert (steps.fresh(said).aperture, steps.fresh(silent).aperture) == (1.4, 2.8)
-
-
-def test_a_correction_by_the_owner_goes_before_the_header(store: Store, steps: Steps) -> None:
-    photo = steps.receive(aperture=2.8, lens_serial="mine")
+def test_the_owners_correction_goes_before_the_header_and_that_before_what_came_with_the_file(
+    store: Store, steps: Steps
+) -> None:
+    photo, silent = steps.receive(aperture=2.8, lens_serial="mine"), steps.receive(aperture=2.8)
     steps.inspect(photo, aperture=1.4)
+    steps.inspect(silent, aperture=None)
+    assert (steps.fresh(photo).aperture, steps.fresh(silent).aperture) == (1.4, 2.8)
 
     store.photos.change([photo.public_id], OWNER, {"aperture": 2.0})
     store.photos.fail(photo.public_id, 2, "time_limit", "late")

@@ -1,11 +1,9 @@
 import numpy as np
 import pytest
 
-from lab.correction.correction_benchmark import SoftCorners, correct_table, run_correct_benchmark
+from lab.correction.correction_benchmark import correct_table, run_correct_benchmark
 from lab.peers import Peer
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import rms_width
-from lensmodel.core.types import FieldPosition
 
 
 @pytest.mark.slow  # the next one corrects the same photo, a part of it
@@ -33,11 +31,3 @@ def test_benchmark_of_a_window_counts_its_pixels_only() -> None:
     assert report["megapixels"] == pytest.approx(0.011)
     with pytest.raises(InvalidInputError, match="does not lie"):
         run_correct_benchmark(photo, methods=("fast",), roi=(150, 0, 100, 110))
-
-
-def test_lens_for_timing_is_softer_in_the_corner() -> None:
-    lens = SoftCorners()
-
-    widths = [rms_width(lens.kernel_at(FieldPosition(r, 0.5), "g", 21)) for r in (0.0, 1.0)]
-
-    assert widths[0] < 1.0 < widths[1]

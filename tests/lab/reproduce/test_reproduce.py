@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from PIL import Image
-from scipy import ndimage
 
-from lab.images import EVERY, blocks, fidelity, to_srgb
 from lab.kernels import distance
 from lab.reproduce import cases, job, measure
 from lab.reproduce.cases import BEFORE, PAPER_WAY, RIVAL, TRUE, Case, Reproduction, key_of, planned
@@ -24,16 +21,15 @@ from lab.reproduce.fields import MeanField, general_field, symmetric
 from lab.reproduce.figures import Flow
 from lab.reproduce.job import paper_way, run_reproduction
 from lab.reproduce.page import collected, write_json, write_page
-from lab.reproduce.tables import Bar, bars, groups, held, kept, paths, share, summary
+from lab.reproduce.tables import Bar, bars, held, kept, paths, share, summary
 from lab.scenes import HARD_SCENES
 from lab.stored import version_of
 from lab.traced import read_grid
 from lensmodel.blind.sampling import PRESETS, Config
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import PsfField, PsfSample, as_kernel
-from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, Frame, Kernel, zone_of
-from lensmodel.photo import develop
-from lensmodel.simulate import LENS_KINDS, photograph, write_photo
+from lensmodel.core.psf import as_kernel
+from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, Frame, zone_of
+from lensmodel.simulate import LENS_KINDS
 
 DRAW = job.figures.draw
 
@@ -80,20 +76,6 @@ def test_traced_case_has_the_pitch_the_aperture_and_the_truth_of_its_grid() -> N
     one, grid, place = traced(), read_grid(HELIAR), FieldPosition(0.7, 2.0)
     assert (one.settings.aperture, one.camera.pitch_um) == (3.5, grid.pitch_um)
     np.testing.assert_array_equal(one.truth().kernel_at(place, "b", 31), grid.kernel_at(place, "b", 31))
-
-
-def test_a_design_at_two_apertures_is_two_lenses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    grid, seen = read_grid(HELIAR), list[PsfField]()
-    replace(grid, facts={**grid.facts, "f_number": 5.6}).write(tmp_path / "stopped.npz")
-
-    def fit(truth: PsfField, _: Sequence[PsfSample]) -> Callable[[FieldPosition], Kernel]:
-        seen.append(truth)
-        return lambda place: truth.kernel_at(place, "g", 31)
-
-    monkeypatch.setattr(job.figures, "WAYS", {"itself": fit})
-    job.figures._fig2([traced(), traced(tmp_path / "stopped.npz")], tmp_path / "fig2.png")
-
-    assert len(seen) == 1 + 2  # for the picture, and for the table
 
 
 def test_key_of_a_traced_lens_follows_the_content_of_its_grid(tmp_path: Path) -> None:
@@ -180,13 +162,6 @@ def test_smallest_grid_that_covers_a_wanted_frame_is_taken(tmp_path: Path) -> No
     for files, frame, why in ((paths, (400, 600), "give larger ones"), (paths[:1], None, "two photographs")):
         with pytest.raises(InvalidInputError, match=why):
             cases.layout_for(files, frame)
-
-
-def test_cut_leaves_an_even_margin_of_half_a_kernel_at_most() -> None:
-    scene = np.zeros((3, 161, 140), dtype=np.float32)
-    assert cases.centred_cut(scene, 100, 100).shape == (3, 156, 140)
-    with pytest.raises(InvalidInputError, match="cover"):
-        cases.centred_cut(scene, 100, 200)
 
 
 def test_key_changes_with_settings_and_code() -> None:
@@ -333,14 +308,6 @@ def test_files_of_other_kinds_are_judged_by_what_raw_ones_gain() -> None:
     assert met == {"TIFF: gain in PSNR over that of raw": False, "JPEG: gain in PSNR over that of raw": True}
 
 
-def test_families_are_judged_and_shown_apart() -> None:
-    made = result((190, 33.0), (120, 29.0))
-    made["cases"][-1] |= {"family": "ray-traced"}
-    falls = [b for b in bars(made) if b.name.startswith("zones where PSNR falls") and b.n == "1"]
-    assert {bar.family: bar.value for bar in falls} == {"third order": 0, "ray-traced": 3}
-    assert list(groups(made)) == ["third order", "ray-traced"]
-
-
 def test_page_shows_every_way_lens_and_refusal_and_needs_nothing_from_outside(tmp_path: Path) -> None:
     made, way, bench = result((160, 32.0), (120, 29.0)), f"{PAPER_WAY}, n = 1", tmp_path / "bench"
     one, other = made["cases"]
@@ -387,16 +354,6 @@ def test_true_kernels_have_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["predicted_right"] == 0.0  # it expected an error of 0.1 where there was none
 
 
-def test_fidelity_is_the_psnr_where_nothing_moved() -> None:
-    frame, rng = Frame(300, 420), np.random.default_rng(0)
-    reference = ndimage.gaussian_filter(rng.random((3, 300, 420)), (0, 2, 2)).astype(np.float32)
-    image = reference + rng.normal(0.0, 0.01, reference.shape).astype(np.float32)
-    found = fidelity(image, reference, frame)
-    assert len(blocks(frame)) <= EVERY
-    whole = -10.0 * math.log10(np.square(to_srgb(image) - to_srgb(reference)).mean())
-    assert found == pytest.approx(dict.fromkeys(ZONES, whole), abs=0.3)
-
-
 @pytest.mark.parametrize("name", HARD_SCENES)
 def test_scenery_is_light_of_the_same_frame_and_not_the_scene_itself(name: str) -> None:
     scene = np.random.default_rng(1).random((3, 160, 240), dtype=np.float32)
@@ -406,23 +363,6 @@ def test_scenery_is_light_of_the_same_frame_and_not_the_scene_itself(name: str) 
     assert made.min() >= 0.0
     assert np.abs(made - scene).mean() > 0.01
     assert np.array_equal(made, change(scene, np.random.default_rng(2)))
-
-
-@pytest.mark.parametrize("name", ["tiff", "jpeg"])
-def test_other_kinds_of_photos_show_what_raw_ones_do(tmp_path: Path, name: Literal["tiff", "jpeg"]) -> None:
-    files = photographs(tmp_path, 4)
-    one = Case(1006, (1,), 32, 64, cases.layout_for(files, (32, 64)))
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    scene = cases.centred_cut(cases.frame_scene(files, one.layout, None), 32, 64)
-    photo = photograph(scene, one.lens, one.settings, one.camera, np.random.default_rng(0))
-    write_photo(folder / "photo.dng", photo)
-    seen = develop(cases.in_container(folder / "photo.dng", name))
-    assert seen.info.kind == name
-    assert seen.info.metadata.aperture == pytest.approx(one.settings.aperture, abs=0.01)
-    gains = np.asarray(one.camera.white_balance, dtype=np.float32)[:, None, None]
-    red = (photo.sharp * gains)[0]
-    assert float(np.median(seen.planes[0])) == pytest.approx(float(np.median(red)), abs=0.02)
 
 
 @pytest.mark.parametrize("frame", [Frame(480, 640), Frame(1808, 2816)])

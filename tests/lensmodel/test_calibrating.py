@@ -13,7 +13,6 @@ from typing import BinaryIO
 import numpy as np
 import pytest
 import rawpy
-from running import write_photo
 
 import lensmodel
 from lab.kernels import gaussian
@@ -25,8 +24,6 @@ from lensmodel.core.errors import (
     CancelledError,
     InvalidInputError,
     MetadataMissingError,
-    NotEnoughEvidenceError,
-    NoUsablePatchesError,
 )
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings, Plane
@@ -178,23 +175,3 @@ def test_a_calibration_that_is_cancelled_is_no_photo_that_failed(
 
     with pytest.raises(CancelledError, match="enough"):
         lensmodel.calibrate(photos)
-
-
-def test_a_selector_is_a_name_or_an_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Everywhere:
-        """A selector of one's own."""
-
-        name, version = "everywhere", 1
-
-    def find_patches(_: object, *, selector: object, **__: object) -> None:
-        asked.append(selector)
-        raise NoUsablePatchesError("no patch was chosen")
-
-    own, asked = Everywhere(), list[object]()
-    monkeypatch.setattr(sampling, "find_patches", find_patches)
-    path = write_photo(tmp_path / "one.dng", 1)
-    for selector in ("good-regions", own):
-        with pytest.raises(NotEnoughEvidenceError, match="no patch was chosen"):
-            lensmodel.calibrate(path, selector=selector, workers=1)  # type: ignore[arg-type]  # never asked to score
-
-    assert asked == ["good-regions", own]

@@ -10,7 +10,7 @@ import lensmodel
 from lab.images import fidelity
 from lensmodel import api, correction, photo
 from lensmodel.blind import sampling
-from lensmodel.core.errors import InvalidInputError, MetadataMissingError, NotEnoughEvidenceError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import to_json
 from lensmodel.core.psf import PsfSample, delta
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -142,27 +142,6 @@ def test_a_patch_that_took_no_part_becomes_a_sample_all_the_same(city: LinearPho
     )
 
     assert [sample.position for sample in found[:2]] == [patch.position for patch in group]
-
-
-def test_photos_that_cannot_help_are_skipped_with_the_reason(tmp_path: Path) -> None:
-    text = tmp_path / "notes.jpg"
-    text.write_text("not a photo", encoding="utf-8")
-    events: list[sampling.CalibrationEvent] = []
-
-    with pytest.raises(NotEnoughEvidenceError, match=r"notes\.jpg"):
-        lensmodel.calibrate(text, on_event=events.append)
-
-    assert [event.stage for event in events] == ["skipped"]
-
-
-def test_photo_without_aperture_asks_for_it(tmp_path: Path) -> None:
-    from PIL import Image  # noqa: PLC0415 - one test needs it
-
-    path = tmp_path / "scan.png"
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (300, 400, 3), dtype=np.uint8)).save(path)
-
-    with pytest.raises(MetadataMissingError, match="--aperture"):
-        sampling.samples_of_photo(path)
 
 
 def test_settings_given_by_hand_fill_what_the_file_does_not_say() -> None:

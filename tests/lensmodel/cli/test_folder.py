@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import re
 import shutil
 from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 
-import numpy as np
 import pytest
 from in_process import lensmodel
 from PIL import Image
-from PIL.TiffImagePlugin import IFDRational
-from rich.console import Console
 from running import SMALL, lens_of_one_blur, write_photo
 
 from lensmodel.blind.sampling import photo_id
-from lensmodel.cli.console import Bar
-from lensmodel.cli.correct import Shot, groups, table_of
+from lensmodel.cli.correct import Shot, groups
 from lensmodel.model import load_profile, save_profile
 from lensmodel.model.profile import Camera
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
@@ -74,20 +68,6 @@ def test_each_lens_has_a_line_in_the_table(journey: Path) -> None:
     assert re.findall(r"#(\S+),", text) == ["L-42", "L-43"]
     figures = [line[26:].split() for line in text.splitlines() if "──" not in line][2:]
     assert [row[:5] for row in figures if row] == [["2", "2", "2", "0", "0"], ["1", "0", "0", "1", "0"]]
-
-
-def test_the_table_fits_a_terminal_of_80_columns() -> None:
-    counts = {"photos": 12345, "learned_from": 8, "corrected": 9876, "corrected_before": 3, "left": 1000}
-    camera = {"camera": "Canon EOS R5 Mark II, unknown camera", "failed": 99, **counts}
-    row = camera | {"lens": "RF100-400mm #1234", "focal_length": "100-118 mm", "expected_gain_db": 0.0}
-    long = camera | {"lens": "[24-105]:camera:_IS_USM_without_blanks", "focal_length": "400 mm"}
-    console = Console(width=200, file=io.StringIO())
-    console.print(table_of([row, long | {"expected_gain_db": None}]))
-    text = console.file.getvalue()  # type: ignore[attr-defined]  # of `io.StringIO`
-
-    assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
-    assert "400 mm" in text
-    assert str(long["lens"]) in "".join(line[:26].rstrip() for line in text.splitlines())  # whole, as it is
 
 
 def test_what_cannot_be_read_is_named_and_the_rest_goes_on(journey: Path) -> None:
@@ -151,20 +131,6 @@ def test_quiet_says_nothing_but_errors_and_verbose_tells_of_each_photo(journey: 
     assert quiet.stdout == ""
     assert len(quiet.stderr.splitlines()) == 1
     assert "a-corrected.tif is there already" in verbose.stderr
-
-
-def test_all_lenses_are_learned_before_photos_are_corrected(
-    card: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(card / "holiday", tmp_path / "holiday", ignore=shutil.ignore_patterns("corrected"))
-    shutil.copytree(card / "lenses", tmp_path / "lenses")
-    monkeypatch.setitem(Bar.__init__.__kwdefaults__, "every_s", 0.0)
-
-    lines = re.findall(r"\] +(\d+) % (\w+)", lensmodel(*AUTO, cwd=tmp_path).stderr)
-
-    parts = [(verb, [int(share) for share, _ in part]) for verb, part in groupby(lines, lambda line: line[1])]
-    assert [verb for verb, _ in parts] == ["learning", "correcting"]
-    assert parts[-1][1][-1] == 100
 
 
 @pytest.mark.slow
@@ -267,19 +233,10 @@ def _cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
 
 
-def _cut_picture(path: Path) -> None:
-    exif = Image.Exif()
-    exif.get_ifd(0x8769)[0x829D] = IFDRational(28, 10)
-    pixels = np.random.default_rng(0).integers(0, 255, (200, 300, 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(path, "JPEG", exif=exif)
-    _cut(path)
-
-
 USELESS = {
     "a.dng": (partial(write_photo, seed=1, shape=SMALL, aperture=None), "does not say its aperture"),
     "b.dng": (_cut, "copy it again"),
     "c.dng": (partial(shutil.copy, REPORTS / "quad-bayer.dng"), "4 x 4"),
-    "d.jpg": (_cut_picture, "ends before its picture"),
 }
 
 

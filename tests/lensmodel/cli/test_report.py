@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 from lab.kernels import gaussian
 from lensmodel.cli.console import UsageError
 from lensmodel.cli.main import app
-from lensmodel.cli.report import name_of
 from lensmodel.core.files import from_json
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -87,15 +86,13 @@ def test_a_name_that_ends_as_a_form_is_that_file_alone(folder: Path, green_alone
     assert (folder / "out" / "mine.pdf").read_bytes().startswith(b"%PDF-")
 
 
-def test_the_page_says_what_it_rests_on_and_names_a_maker_once() -> None:
+def test_the_page_says_what_it_rests_on() -> None:
     found = provenance("12", ["Canon EOS 6D", "Canon EOS 6D", ""], ["b.dng", "a.jpg"])
 
     assert found | {"Serial number": "12", "Camera": "Canon EOS 6D", "Photos": "a.jpg, b.dng"} == found
     assert found["Caution"].startswith("Learned from JPEG files (1 of 2 photos): the camera's sharpening")
     assert not {"Caution", "Serial number"} & provenance(None, [], ["b.dng"]).keys()
     assert provenance(None, [], [f"{k}.dng" for k in range(20)])["Photos"].endswith("and 12 more")
-    assert name_of({"maker": "Acme", "model": "ACME 42mm"}) == "ACME 42mm"
-    assert name_of({"maker": "Acme", "model": "42mm"}) == "Acme 42mm"
 
 
 def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:

@@ -458,13 +458,6 @@ def corrected(source: Path, target: Path, output: photo.OutputFormat, **options:
     return target
 
 
-@pytest.mark.parametrize("output", [*FORMATS, "tiff32"])
-def test_copyright_and_artist_are_kept(output: photo.OutputFormat, tmp_path: Path) -> None:
-    said = photo.inspect(corrected(REPORTS / "copyright.jpg", tmp_path / "x", output)).metadata
-
-    assert (said.copyright, said.artist) == ("(c) 2024 Example", "Example")
-
-
 @pytest.mark.parametrize("rating", [-1, 0, 4])
 @pytest.mark.parametrize("output", [*FORMATS, "tiff32"])
 def test_rights_authors_rating_and_keywords_of_xmp_are_kept(

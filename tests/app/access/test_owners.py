@@ -373,6 +373,8 @@ def test_a_key_is_made_listed_and_ended(tmp_path: Path) -> None:
     assert states == ["revoked"]
     with pytest.raises(UsageError, match="such as 90d; got '3months'"):
         run(tmp_path, "create", "--expires", "3months")
+    with pytest.raises(UsageError, match="owner's name"):
+        run(tmp_path, "create", "--owner", "|")
     with pytest.raises(InvalidInputError, match="no key begins with abcd2345"):
         run(tmp_path, "revoke", "abcd2345")
 

@@ -6,7 +6,6 @@ import contextlib
 import ctypes
 import errno
 import importlib
-import io
 import itertools
 import os
 import signal
@@ -67,23 +66,6 @@ def open_files(arguments: dict[str, Any], folder: Path, progress: ProgressHook) 
         while True:
             held.append((folder / "a").open("w"))
     return len(held)
-
-
-class _Full(io.RawIOBase):
-    """A file on a full disk."""
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, _: object) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-def fill_the_disk(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
-    sys.stdout = io.TextIOWrapper(io.BufferedWriter(_Full()))
-    sys.stdout.write("what is printed does not fit either")
-    if arguments["with_files"]:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def probe(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, str]:
@@ -263,7 +245,6 @@ def link(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> Non
 
 TASKS = {name: each for name, each in globals().items() if isinstance(each, FunctionType) and name[0] != "_"}
 TASKS |= {
-    "abort": lambda *_: ctypes.CDLL(None).abort(),
     "blunder": lambda *_: {}["nobody thought of this"],
     "crash": lambda *_: ctypes.string_at(0),
     "die": lambda *_: os.kill(os.getpid(), signal.SIGKILL),

@@ -12,6 +12,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -285,3 +286,9 @@ def test_a_retry_gives_way_to_the_same_wish_made_again(store: Store, steps: Step
     store.jobs.correct(row.photo, row.lens, row.lens_version, row.params)
 
     assert not store.jobs.retry(key, ANY_OWNER)
+
+
+def test_the_engines_file_is_in_wal_mode(start: Start, tmp_path: Path) -> None:
+    start()
+    with closing(sqlite3.connect(tmp_path / "jobs.db")) as connection:
+        assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)

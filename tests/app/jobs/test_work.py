@@ -678,3 +678,12 @@ def test_a_name_that_is_too_long_is_cut_and_its_photo_goes_on(bench: Bench) -> N
     photo = bench.work()
 
     assert (photo.state, len(photo.camera_model)) == ("counted", 200)
+
+
+def test_time_is_limited_by_what_a_task_computes(bench: Bench) -> None:
+    photo, settings = bench.received(), bench.context.settings
+    developing, correcting = (bench.context.limits(task, photo) for task in ("develop", "correct"))
+
+    assert developing.processor_s == settings.task_seconds / 20
+    assert developing.wall_s == settings.task_seconds  # a busy machine takes nothing from it
+    assert correcting.processor_s == settings.task_seconds * settings.worker_slots

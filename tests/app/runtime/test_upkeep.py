@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import random
 import threading
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from conftest import Steps
 from sqlalchemy import text
+from sqlalchemy.exc import IntegrityError
 from typer.testing import CliRunner
 
 from app.blobs.storage import Storage
@@ -332,3 +334,26 @@ def test_invariants_hold_in_any_order_of_steps(store: Store, steps: Steps, seed:
             assert broken(session) == {}
         most = max([most, *(lens.sample_count for lens in store.lenses.page("local", before=None, limit=10))])
     assert most > 0
+
+
+def test_a_backup_by_the_command_is_a_data_folder(
+    photos: list[PhotoRow], settings: Settings, folder: Path
+) -> None:
+    made = CliRunner().invoke(app, ["backup", str(folder), "--data", str(settings.data_dir)])
+    checked = CliRunner().invoke(app, ["doctor", "--deep", "--data", str(folder), "--json"])
+
+    assert made.exit_code == 0, made.output
+    assert f"{folder}: 3 photos and " in made.stdout
+    assert {finding["check"] for finding in json.loads(checked.stdout)["findings"]} <= {"work", "files"}
+
+
+def test_the_schema_guards_the_history(store: Store, steps: Steps) -> None:
+    steps.counted()
+    for statement in (
+        "UPDATE calibration_event SET kind = 'nonsense'",
+        "INSERT INTO calibration_event (lens_id, version, kind, photo_public_id, epoch, samples_added,"
+        " samples, photos, created_at) SELECT lens_id, 9, kind, photo_public_id, epoch, 0, 0, 0, created_at"
+        " FROM calibration_event",
+    ):
+        with pytest.raises(IntegrityError), store.database.writing() as session:
+            session.execute(text(statement))

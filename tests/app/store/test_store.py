@@ -485,3 +485,17 @@ def test_pages_are_found_by_an_index(store: Store, steps: Steps) -> None:
             plan = [row[-1] for row in explained.all()]
             assert any(index in step for step in plan), plan
             assert not any(step.startswith(("SCAN", "USE TEMP B-TREE")) for step in plan), plan
+
+
+def test_a_correction_is_finished_by_who_took_it_up_last_unless_cancelled(store: Store, steps: Steps) -> None:
+    jobs, row = store.jobs, steps.correct(steps.counted())
+    file = {"key": "k", "etag": "e", "media_type": "image/tiff", "bytes": 1, "name": "n"}
+    lost, run = jobs.start(row.public_id, 1), jobs.start(row.public_id, 1)
+    assert not jobs.finish(lost, {}, **file)
+    jobs.progress(run, 1, 2)
+
+    assert jobs.cancel(row.public_id, OWNER)
+
+    assert not jobs.finish(run, {}, **file)
+    assert not jobs.start(row.public_id, 1)
+    assert not jobs.is_live(row.public_id, 1)

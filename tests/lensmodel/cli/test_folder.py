@@ -9,6 +9,7 @@ import shutil
 from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from PIL import Image
 from running import SMALL, lens_of_one_blur, write_photo
 
 from lensmodel.blind.sampling import photo_id
+from lensmodel.cli.console import Bar
 from lensmodel.cli.correct import Shot, groups
 from lensmodel.model import load_profile, save_profile
 from lensmodel.model.profile import Camera
@@ -259,3 +261,17 @@ def test_what_teaches_nothing_for_another_reason_than_its_detail_fails_with_that
     (result,) = json.loads(done.stdout)["results"]
     assert result["state"] == "failed"
     assert reason in result["reason"]
+
+
+def test_all_lenses_are_learned_before_photos_are_corrected(
+    card: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(card / "holiday", tmp_path / "holiday", ignore=shutil.ignore_patterns("corrected"))
+    shutil.copytree(card / "lenses", tmp_path / "lenses")
+    monkeypatch.setitem(Bar.__init__.__kwdefaults__, "every_s", 0.0)
+
+    lines = re.findall(r"\] +(\d+) % (\w+)", lensmodel(*AUTO, cwd=tmp_path).stderr)
+
+    parts = [(verb, [int(share) for share, _ in part]) for verb, part in groupby(lines, lambda line: line[1])]
+    assert [verb for verb, _ in parts] == ["learning", "correcting"]
+    assert parts[-1][1][-1] == 100

@@ -561,3 +561,10 @@ def test_a_damaged_list_gives_what_came_before_the_damage(cut: int) -> None:
     assert read_opcodes(block[:cut]) == []
     assert len(read_opcodes(struct.pack(">I", 2**32 - 1) + block[4:])) == 1
     assert demosaiced([Opcode(9, 0, 0, block[20:60])], None)[0] == []
+
+
+@pytest.mark.parametrize("output", [*FORMATS, "tiff32"])
+def test_copyright_and_artist_are_kept(output: photo.OutputFormat, tmp_path: Path) -> None:
+    said = photo.inspect(corrected(REPORTS / "copyright.jpg", tmp_path / "x", output)).metadata
+
+    assert (said.copyright, said.artist) == ("(c) 2024 Example", "Example")

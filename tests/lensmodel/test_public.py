@@ -266,3 +266,8 @@ def test_a_terminal_shows_each_step_and_a_notebook_whole_lines(
     say("a.dng: done", stays=True)
 
     assert capsys.readouterr().err == said
+
+
+def test_a_lens_is_shown_in_words(lens: Lens) -> None:
+    assert "0x" not in repr(lens)
+    assert f"{len(lens.samples)} samples" in repr(lens)

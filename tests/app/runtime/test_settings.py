@@ -94,3 +94,9 @@ def test_no_secret_is_written_down_no_image_floats_and_ports_are_on_loopback(nam
     assert all(port.startswith("127.0.0.1:") for port in service.get("ports", []))
     for other, wait in service.get("depends_on", {}).items():  # that is there, and can tell its health
         assert wait["condition"] != "service_healthy" or "test" in SERVICES[other]["healthcheck"]
+
+
+def test_an_unknown_estimator_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"no estimator 'nothing'; known: .*michaeli-irani"):
+        Settings(estimator="nothing")
+    assert Settings(estimator="michaeli-irani").estimator == "michaeli-irani"

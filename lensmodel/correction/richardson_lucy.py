@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -33,10 +34,11 @@ from lensmodel.correction.deconvolver import Sensor
 Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 """How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""
 
+_Response: TypeAlias = tuple[Real, Number, Number]
+
 _ACCELERATIONS: Final = get_args(Acceleration)
 _ALPHA_MAX: Final = 0.9  # of the fixed extrapolation; above it the noise is accelerated as well
-_SHARPNESS: Final = np.float32(50.0)  # a of the sensor response (chosen: bends over a tenth of clipping)
-_BEND: Final = np.float32(15.0)  # a (z - t) from which on the response is straight: to a millionth
+_SHARPNESS: Final = 50.0  # a of the sensor response: it bends over a tenth of the clipping level (chosen)
 _REACH_FLOOR: Final = 0.05
 """Share of the largest F^T 1, the least to divide by (chosen: less lets noise explode, more darkens rims)."""
 _LIGHT: Final = 0.9
@@ -138,6 +140,7 @@ def richardson_lucy_steps(
         blur.spectrum(shape),
         np.float32(base),
         np.float32(sensor.clip),
+        _response(),
         fixed.astype(np.float32),
         acceleration == "adaptive",
         shape[1],
@@ -155,6 +158,20 @@ def _background(sensor: Sensor) -> float:
     if sensor.noise.shot <= 0.0:
         return 0.0
     return min(sensor.noise.read / sensor.noise.shot, 1.0)
+
+
+@lru_cache(maxsize=1)
+def _response() -> _Response:
+    """R and R' at even steps of light over clipping level, and the first and last step.
+
+    Below that range R equals the light and above it the clipping level, to a millionth.
+    """
+    first, last = 1.0 - 15.0 / _SHARPNESS, 1.0 + 25.0 / _SHARPNESS
+    light = np.linspace(first, last, 4097).astype(np.float32)
+    over = _SHARPNESS * (light - 1.0)
+    recorded = light - np.logaddexp(0.0, over) / _SHARPNESS
+    slope = 0.5 * (1.0 - np.tanh(0.5 * over))  # the logistic function without overflow
+    return np.stack([recorded, slope]).astype(np.float32), np.float32(first), np.float32(last)
 
 
 @jit
@@ -203,26 +220,33 @@ def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
 
 
 @jit
-def _errors(light: Real, data: Real, base: Number, clip: Number) -> None:
+def _errors(light: Real, data: Real, base: Number, clip: Number, response: _Response) -> None:
     """Error of what a row of light predicts, in place: ( data / (R + base) - 1 ) R'.
 
-    Far below the clipping level R is the light itself, far above it R' is zero, both to a millionth.
+    Below the `response` the sensor records the light itself, above it `clip`. A logarithm and two
+    exponentials for each pixel of a blown area would take ten times as long as all transforms.
     """
+    bend, first, last = response
     brightest = ZERO
     for j in range(light.size):
         brightest = max(brightest, light[j])
-    if brightest <= clip * (ONE - _BEND / _SHARPNESS):  # no branch in the loop: several pixels at a time
+    if brightest <= first * clip:  # no branch in the loop: several pixels at a time
         for j in range(light.size):
             light[j] = data[j] / max(max(light[j], ZERO) + base, _LEAST_PREDICTED * data[j], _TINY) - ONE
         return
+    top = np.float32(bend.shape[1] - 1)
+    share, steps = ONE / clip, top / (last - first)
     for j in range(light.size):
-        recorded, slope = max(light[j], ZERO), ONE
-        over = _SHARPNESS * (recorded / clip - ONE)
-        if over > -_BEND:
-            rest = np.exp(-abs(over))
-            recorded = min(recorded, clip) - clip / _SHARPNESS * np.log1p(rest)
-            slope = (rest if over > ZERO else ONE) / (ONE + rest)
-        light[j] = (data[j] / max(recorded + base, _LEAST_PREDICTED * data[j], _TINY) - ONE) * slope
+        predicted = max(light[j], ZERO)
+        at = min((predicted * share - first) * steps, top)
+        if not at > ZERO:  # a NaN stays one
+            light[j] = data[j] / max(predicted + base, _LEAST_PREDICTED * data[j], _TINY) - ONE
+        else:
+            k = min(np.int32(at), np.int32(bend.shape[1] - 2))
+            part = at - np.float32(k)
+            recorded = clip * (bend[0, k] + part * (bend[0, k + 1] - bend[0, k]))
+            slope = bend[1, k] + part * (bend[1, k + 1] - bend[1, k])
+            light[j] = (data[j] / max(recorded + base, _LEAST_PREDICTED * data[j], _TINY) - ONE) * slope
 
 
 @jit
@@ -254,6 +278,7 @@ def _steps(  # noqa: C901 - one pass over memory per loop
     K: Complex,
     base: Number,
     clip: Number,
+    response: _Response,
     alphas: Real,
     adaptive: bool,
     width: int,
@@ -282,7 +307,7 @@ def _steps(  # noqa: C901 - one pass over memory per loop
     for step in range(steps):
         through(work, P, K, FORWARD, 0, rows, top, bottom)
         for i in range(high):
-            _errors(work[top + i, left:right], data[i], base, clip)
+            _errors(work[top + i, left:right], data[i], base, clip, response)
             work[top + i, :left] = ZERO
             work[top + i, right:] = ZERO
         split = lights and _lights(start, np.float32(_LIGHT) * clip, top, clean, soft)

@@ -45,9 +45,7 @@ _MIN_SIDE: Final = 16  # pixels (chosen): over it an edge of 2 degrees moves by 
 _MIN_ROWS: Final = 10  # that a line is fitted to: fewer do not tell which of them is off (chosen)
 _REACH: Final = 48.0  # pixels of edge spread on each side; more only adds noise
 _MAX_CORRECTION: Final = 10.0  # ISO 12233: limit of the division by the difference's response
-_LENGTH: Final = (
-    2048  # of its Fourier transform, over a profile of twice the reach: fine enough to interpolate
-)
+_LENGTH: Final = 2048  # of its Fourier transform: several times a profile, fine enough to interpolate
 _MIN_STEP_OVER_NOISE: Final = 3.0  # standard deviations: weaker steps are noise (chosen)
 
 

@@ -318,7 +318,7 @@ def transfers(
 BLOCK: Final = 4  # pixels of a coarse plane's block: coarser than detail, finer than objects (chosen)
 
 _JOINT: Final = 4
-"""Pixels over which the ends of a tile whose rim is cut off fade into each other (chosen: none rings)."""
+"""Pixels over which the ends of a tile whose rim is cut off fade into each other (chosen: 0 would ring)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,7 +32,7 @@ _LEVEL: Final = 0.1
 _LINE_SHARE, _EDGE_SHARE = 0.12, 0.25
 """Share of a window at the level of a line, and of an edge (chosen: a line is narrower than its blur)."""
 _PURER: Final = 0.01
-"""By how much a colour's share may leave the range nearby (chosen: twice as much gives dots)."""
+"""By how much a colour's share may leave the range nearby (chosen: 0 gives dots, twice it spoils foliage)."""
 _COLOURLESS: Final = 0.05
 """Share of the brightest light nearby that is added as grey: what is far darker shows no colour (chosen)."""
 _OWN_COLOURLESS: Final = 0.02  # the same for the pixel itself (chosen: with more, black letters get green)

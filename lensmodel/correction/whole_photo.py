@@ -15,6 +15,7 @@ import numpy as np
 from numba.core import event
 
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.numerics import jit
 from lensmodel.core.psf import PsfField
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import (
@@ -32,7 +33,7 @@ from lensmodel.core.types import (
     zone_of,
 )
 from lensmodel.correction.audit import AuditReport, pooled
-from lensmodel.correction.blur import UniformBlur, crop_to_support
+from lensmodel.correction.blur import Real, UniformBlur, crop_to_support
 from lensmodel.correction.cell import (
     Cell,
     CorrectionJob,
@@ -296,8 +297,22 @@ def _add(out: Planes, window: Roi, cell: Cell, restored: Planes) -> None:
     bottom = min(cell.bottom, window.top + window.height)
     right = min(cell.right, window.left + window.width)
     rows, cols = slice(top - cell.top, bottom - cell.top), slice(left - cell.left, right - cell.left)
-    part = out[:, top - window.top : bottom - window.top, left - window.left : right - window.left]
-    part += np.outer(cell.rise[rows], cell.run[cols]) * restored[:, rows, cols]
+    at, part = (top - window.top, left - window.left), (top - cell.top, left - cell.left)
+    # strides that a compiler does not know cost more than a copy
+    planes = np.ascontiguousarray(restored)
+    _add_weighted(out, at, cell.rise[rows], cell.run[cols], planes, part)
+
+
+@jit
+def _add_weighted(
+    out: Real, at: tuple[int, int], rise: Real, run: Real, planes: Real, part: tuple[int, int]
+) -> None:
+    """Add planes from pixel `part` on, times a weight for each row and each column, to `out` from `at` on."""
+    for c in range(planes.shape[0]):
+        for i in range(rise.size):
+            weight, line, into = rise[i], planes[c, part[0] + i], out[c, at[0] + i]
+            for j in range(run.size):
+                into[at[1] + j] += weight * run[j] * line[part[1] + j]
 
 
 @cache

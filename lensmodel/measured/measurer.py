@@ -260,7 +260,10 @@ def solve(
     kernel = as_kernel(k.reshape(size, size))
     row, col = np.add(centroid(kernel), moved)
     # root of the posterior variance of all values over the norm of the kernel; 1 is the worst
-    posterior = scipy.linalg.inv(gram[:n, :n] + np.diag(prior), check_finite=False)
+    try:
+        posterior = scipy.linalg.inv(gram[:n, :n] + np.diag(prior), check_finite=False)
+    except scipy.linalg.LinAlgError as error:
+        raise NotEnoughEvidenceError(_NO_KERNEL) from error
     spread = float(np.maximum(np.diag(posterior), 0.0).sum())
     return Solved(kernel, light, (float(row), float(col)), min(math.sqrt(spread / float(k @ k)), 1.0))
 

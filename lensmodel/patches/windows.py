@@ -61,9 +61,8 @@ class Windows:
     contrast: NDArray[np.float64]  # (n,), variance of the signal, without slopes, over that of the noise
     level: NDArray[np.float64]  # (n,), mean level and the noise's standard deviation there
     sigma: NDArray[np.float64]
-    clipped: NDArray[
-        np.float64
-    ]  # (n,), shares of the pixels above `CLIP_SHARE`, below `DARK_SNR`, not finite
+    # (n,), shares of the pixels above `CLIP_SHARE`, below `DARK_SNR`, and not finite
+    clipped: NDArray[np.float64]
     dark: NDArray[np.float64]
     missing: NDArray[np.float64]
     width: NDArray[np.float64]  # (n,), of the sharper edges, sigma of a Gaussian in pixels; NaN where few

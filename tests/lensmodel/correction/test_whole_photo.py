@@ -215,8 +215,7 @@ def test_smooth_scene_under_a_wide_blur_does_not_gain_noise(noise: tuple[NoiseMo
 
     restored = correct_planes(seen, Soft(3.0, 3.0), LARGE, noise=noise).planes
 
-    # where nothing is changed, weights of cells that fade into each other still round
-    assert rmse(restored, sharp) <= (1.0 + 1e-6) * rmse(seen, sharp)
+    assert rmse(restored, sharp) < rmse(seen, sharp)
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.5])

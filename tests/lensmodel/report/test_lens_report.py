@@ -173,7 +173,9 @@ def test_beyond_the_outermost_square_of_a_chart_nothing_is_known() -> None:
             low, high = spot.tangential * (1.0 + spot.predicted_error * np.array([-1.0, 1.0]))
             assert spot.tangential_range[0] <= max(low, 0.0) + 1e-9
             assert spot.tangential_range[1] >= min(high, 0.5) - 1e-9
-    assert any("(not known)" in row[1] for row in place_table(report)[1])
+    assert {row[1] for row in place_table(report)[1] if "(not known)" in row[1]} == {
+        f"{spot.place[4:]} (not known)" for spot in (*found.spots, *found.sides) if spot.unknown
+    }
     assert charts(report, None)[0].svg.count(b"url(#h") == 2 * unknown.sum()  # hatched, in T and in S
 
 

@@ -68,11 +68,7 @@ class Client(AbstractContextManager["Client"]):
     """
 
     def __init__(
-        self,
-        url: str = "http://127.0.0.1:8000",
-        *,
-        http: httpx2.Client | None = None,
-        key: str | None = None,
+        self, url: str = "http://127.0.0.1:8000", *, http: httpx2.Client | None = None, key: str | None = None
     ) -> None:
         if http is None:
             shown = os.environ.get(CLIENT_KEY, "") if key is None else key

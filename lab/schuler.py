@@ -48,15 +48,7 @@ from lab.model_benchmark import pixel_to_local
 from lensmodel.blind import sampling
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centred, resized
-from lensmodel.core.types import (
-    CHANNELS,
-    Channel,
-    FieldPosition,
-    Kernel,
-    LensSettings,
-    NoiseModel,
-    Planes,
-)
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, NoiseModel, Planes
 from lensmodel.photo import LinearPhoto
 from lensmodel.simulate import draw_lens
 

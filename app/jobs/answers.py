@@ -139,10 +139,7 @@ _ZONE_AUDIT = _answer(
 )
 _HELD = _answer("Held", row=Pixel, col=Pixel, held_back=Share)
 _AUDIT = _answer(
-    "Audit",
-    zones=_several(3, Zone, _ZONE_AUDIT),
-    tiles=(_several(100_000, _HELD), []),
-    tile_side=(Count, 0),
+    "Audit", zones=_several(3, Zone, _ZONE_AUDIT), tiles=(_several(100_000, _HELD), []), tile_side=(Count, 0)
 )
 _REPORT = _answer(
     "Report", zones=_several(3, Zone, _GAIN), nothing_to_correct=(bool, False), audit=(_AUDIT | None, None)

@@ -222,11 +222,7 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     model, about = LensModel.fit(read_samples(folder)), arguments["about"]
     try:
         report = lens_report(
-            model,
-            about["name"],
-            aspect=about["aspect"],
-            height_px=about["height_px"],
-            on_step=progress,
+            model, about["name"], aspect=about["aspect"], height_px=about["height_px"], on_step=progress
         )
     except LensModelError as refusal:
         log.info("a lens without a report: %s", refusal)

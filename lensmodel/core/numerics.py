@@ -29,10 +29,7 @@ _FEW: Final = 256  # unknowns up to which all eigenvalues take no longer than th
 
 
 def nonnegative_least_squares(
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    start: NDArray[np.float64],
-    steps: int = 200,
+    a: NDArray[np.float64], b: NDArray[np.float64], start: NDArray[np.float64], steps: int = 200
 ) -> NDArray[np.float64]:
     """Minimise k'Ak/2 - b'k over k >= 0 by FISTA; scipy's `nnls` wants the matrix of residuals."""
     if not a.any():

@@ -185,13 +185,7 @@ def _powers(y: Real, x: Real, noise: Real, clip: Real, powers: Real) -> None:
 
 @jit
 def _spikes(  # noqa: C901 - one pass over the tile, row by row
-    y: Real,
-    x: Real,
-    noise: Real,
-    clip: Real,
-    gains: Real,
-    part: tuple[int, int, int, int],
-    keep: Real,
+    y: Real, x: Real, noise: Real, clip: Real, gains: Real, part: tuple[int, int, int, int], keep: Real
 ) -> float:
     """Lower `keep` around pixels that stand out of a colour; return the sum of what such in `part` lose."""
     rows, cols = keep.shape

@@ -43,14 +43,7 @@ from lensmodel.core.types import Channel, Kernel, StepHook
 from lensmodel.measured.measurer import Found, Measurer, Prepared, Window
 from lensmodel.measured.target import on_paper
 from lensmodel.photo import LinearPhoto
-from lensmodel.quality import (
-    OVERSAMPLING,
-    FoundEdge,
-    crossing,
-    edge_area,
-    find_edges,
-    slanted_edge,
-)
+from lensmodel.quality import OVERSAMPLING, FoundEdge, crossing, edge_area, find_edges, slanted_edge
 
 _FREQUENCIES: Final = np.linspace(0.0, 0.5, 26)  # cycles/pixel: finer than a kernel resolves (chosen)
 _SLICE_ERROR: Final = 0.02  # of a transfer function: of an edge of 64 lines at 1 percent noise

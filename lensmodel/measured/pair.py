@@ -28,15 +28,7 @@ from scipy import fft, ndimage
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, block_means
-from lensmodel.measured.measurer import (
-    Found,
-    Latent,
-    Measurer,
-    Prepared,
-    Window,
-    window_corners,
-    window_psf,
-)
+from lensmodel.measured.measurer import Found, Latent, Measurer, Prepared, Window, window_corners, window_psf
 from lensmodel.measured.registration import CLEAR, Warp, match, matched
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import PlaneNoise

@@ -27,15 +27,7 @@ from scipy import ndimage, signal, spatial
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
 from lensmodel.core.types import CHANNELS, Channel, NoiseModel, StepHook
-from lensmodel.measured.measurer import (
-    NEAR_CLIP,
-    Found,
-    Measurer,
-    Prepared,
-    Solved,
-    Window,
-    solve,
-)
+from lensmodel.measured.measurer import NEAR_CLIP, Found, Measurer, Prepared, Solved, Window, solve
 from lensmodel.photo import LinearPhoto
 
 _FEWEST: Final = 2  # Lights a cell must have: one alone may be a double star
@@ -131,11 +123,7 @@ class _Lights:
 
 
 def _cell_psf(
-    photo: LinearPhoto,
-    channel: Channel,
-    pixels: NDArray[np.float64],
-    size: int,
-    sky: NDArray[np.float64],
+    photo: LinearPhoto, channel: Channel, pixels: NDArray[np.float64], size: int, sky: NDArray[np.float64]
 ) -> Found:
     """Stack the lights of a cell, and solve for their kernel."""
     corners = np.rint(pixels).astype(int) - size // 2

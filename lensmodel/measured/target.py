@@ -363,11 +363,7 @@ def _solved(
 
 
 def _tones_of(
-    photo: LinearPhoto,
-    placed: PlacedPage,
-    corners: Sequence[tuple[int, int]],
-    side: int,
-    on_step: StepHook,
+    photo: LinearPhoto, placed: PlacedPage, corners: Sequence[tuple[int, int]], side: int, on_step: StepHook
 ) -> tuple[float, float, float]:
     """Fit the tones of the print where the lens is sharpest: how the photo follows R.
 

@@ -117,10 +117,7 @@ def _info_of(path: Path, said: Said, raw: rawpy.RawPy | None, limits: Limits) ->
 
 
 def develop(
-    path: Path | str,
-    *,
-    limits: Limits | None = None,
-    on_info: Callable[[PhotoInfo], None] | None = None,
+    path: Path | str, *, limits: Limits | None = None, on_info: Callable[[PhotoInfo], None] | None = None
 ) -> LinearPhoto:
     """Develop a photo: RAW through LibRaw, TIFF, PNG and JPEG through their transfer curve.
 

@@ -20,11 +20,7 @@ from lensmodel import photo
 from lensmodel.blind import sampling
 from lensmodel.calibration import Calibration, LensStore
 from lensmodel.core import processes
-from lensmodel.core.errors import (
-    CancelledError,
-    InvalidInputError,
-    MetadataMissingError,
-)
+from lensmodel.core.errors import CancelledError, InvalidInputError, MetadataMissingError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings, Plane
 from lensmodel.lens import Lens

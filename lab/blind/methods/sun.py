@@ -24,14 +24,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from lab.blind.steps.kernel_step import (
-    Grid,
-    Term,
-    cleaned,
-    conjugate_gradients,
-    least_squares_kernel,
-    unsure,
-)
+from lab.blind.steps.kernel_step import Grid, Term, cleaned, conjugate_gradients, least_squares_kernel, unsure
 from lab.blind.steps.pyramid import Image, Level, View, coarse_to_fine
 from lab.cases import DATA
 from lensmodel.blind import PsfEstimate

@@ -22,22 +22,9 @@ from lensmodel.core.psf import PsfSample, delta
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Frame, LensSettings
 from lensmodel.model import LensModel, ModelSettings, PsfAnswer
 from lensmodel.quality import mtf50_from_kernel
-from lensmodel.report import (
-    LensReport,
-    compare,
-    filled_aspect,
-    lens_report,
-    place_table,
-    sharpness,
-    to_csv,
-)
+from lensmodel.report import LensReport, compare, filled_aspect, lens_report, place_table, sharpness, to_csv
 from lensmodel.report.centring import Asymmetry, Centring, direction_in_words
-from lensmodel.report.lens_report import (
-    UNKNOWN,
-    SensorGeometry,
-    half_sides,
-    marked_places,
-)
+from lensmodel.report.lens_report import UNKNOWN, SensorGeometry, half_sides, marked_places
 from lensmodel.report.plots import charts, pages, to_pdf, to_png
 
 QUICK = ModelSettings(r=0.3, phi=0.8, mode="paper")
@@ -106,8 +93,7 @@ def test_a_figure_is_told_in_each_unit_and_never_beyond_what_a_sensor_shows() ->
 
 
 @pytest.mark.parametrize(
-    ("pitch", "pairs"),
-    [(14.0, [10, 20, 30]), (2.0, [20, 40, 60, 80]), (None, [None] * 4)],
+    ("pitch", "pairs"), [(14.0, [10, 20, 30]), (2.0, [20, 40, 60, 80]), (None, [None] * 4)]
 )
 def test_curves_lie_below_the_nyquist_frequency(pitch: float | None, pairs: list[int | None]) -> None:
     curves = report_of(rows=1, photos=1, pitch=pitch).tested[0].curves

@@ -128,9 +128,6 @@ def _added(
 
 def target(
     output: Annotated[Path, typer.Argument(metavar="FILE", help="Name ending in .pdf.")],
-    edges: Annotated[
-        bool, typer.Option("--edges", help="35 dark squares, for `lensmodel measure edges`.")
-    ] = False,
     paper: Annotated[
         Literal["a2", "a3", "a4", "letter", "tabloid"],
         typer.Option(help="Size of the paper, in landscape orientation."),
@@ -145,28 +142,21 @@ def target(
     ] = USUAL_DETAIL,
     force: console.Force = False,
 ) -> None:
-    """Write the page to print for `lensmodel measure`.
+    """Write the page to print for `lensmodel measure target`.
 
-    It is for `measure target`, or with --edges for `measure edges`. Print it at full size on matte paper, in
-    grey, without sharpening; fix it flat.
+    Print it at full size on matte paper, in grey, without sharpening; fix it flat.
 
     Examples:
 
         lensmodel target target.pdf
 
-        lensmodel target squares.pdf --edges --paper letter
+        lensmodel target letter.pdf --paper letter --detail 2800
 
     Exit status: 0 written, 1 failed, 2 wrong usage.
     """
-    # takes long
-    from lensmodel.measured import DETAILS, TargetPage, print_chart, print_target  # noqa: PLC0415
-
-    if detail not in DETAILS:
-        raise UsageError(f"--detail must be one of {', '.join(map(str, DETAILS))}, got {detail}")
+    if detail not in measuring.DETAILS:
+        raise UsageError(f"--detail must be one of {', '.join(map(str, measuring.DETAILS))}, got {detail}")
     files.refuse_existing(output, force=force)
     with files.as_usage():
-        if edges:
-            print_chart(output, paper=paper)
-        else:
-            print_target(output, TargetPage(detail), paper=paper)
+        measuring.print_target(output, measuring.TargetPage(detail), paper=paper)
     Display().result(str(output))

@@ -10,7 +10,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
-from lensmodel.measured.edges import SlantedEdges, print_chart
+from lensmodel.measured.edges import SlantedEdges
 from lensmodel.measured.measurer import MeasuredPsf, Measurer, samples_of
 from lensmodel.measured.pair import AperturePair
 from lensmodel.measured.points import Points
@@ -29,7 +29,6 @@ __all__ = [
     "TargetPage",
     "measurements_of",
     "methods",
-    "print_chart",
     "print_target",
     "samples_of",
     "samples_of_developed",

@@ -178,7 +178,11 @@ _GREYS: Final = 64
 def print_target(path: str | Path, page: TargetPage, *, paper: str = "a3") -> None:
     """Write a page to print on a paper of `PAPERS`, as a PDF file."""
     path = Path(path)
-    width, height = on_paper(path, paper)
+    if path.suffix.lower() != ".pdf":
+        raise InvalidInputError(f"{path.name}: what is to be printed is written as .pdf")
+    if paper not in PAPERS:
+        raise InvalidInputError(f"no paper {paper!r}; known: {', '.join(sorted(PAPERS))}")
+    width, height = PAPERS[paper]
     name = f"lensmodel target, detail {page.detail}, {paper.upper()}"
     steps = np.rint(page.raster * (_GREYS - 1)) * (255.0 / (_GREYS - 1))
     picture = Image.fromarray(np.rint(steps).astype(np.uint8))
@@ -191,15 +195,6 @@ def print_target(path: str | Path, page: TargetPage, *, paper: str = "a3") -> No
     with atomic(path) as file:
         # at its best JPEG errs by one of 255 levels, a quarter of the distance between two greys
         picture.save(file, "PDF", resolution=picture.width / (width / 25.4), quality=100, title=name)
-
-
-def on_paper(path: Path, paper: str) -> tuple[float, float]:
-    """Width and height in millimetres of a paper of `PAPERS`, lying; refuse other papers and files."""
-    if path.suffix.lower() != ".pdf":
-        raise InvalidInputError(f"{path.name}: what is to be printed is written as .pdf")
-    if paper not in PAPERS:
-        raise InvalidInputError(f"no paper {paper!r}; known: {', '.join(sorted(PAPERS))}")
-    return PAPERS[paper]
 
 
 # --- its PSFs ------------------------------------------------------------------------------------

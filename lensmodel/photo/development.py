@@ -66,7 +66,7 @@ from lensmodel.photo.values import (
     Transfer,
     remarks_log,
 )
-from lensmodel.photo.writing import OPCODES_2, OPCODES_3, demosaiced, packed_opcodes, read_opcodes
+from lensmodel.photo.writing import OPCODES_2, OPCODES_3
 
 MIN_SIDE = 16  # smaller pictures are icons, not photos
 
@@ -302,14 +302,15 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
     tags, mosaic, white, clip = said.tags, Mosaic.of(raw), int(raw.white_level), (1.0, 1.0, 1.0)
     # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing, and stretches them
     lossy = said.header.compression == LOSSY_DNG
-    steps = [] if lossy else read_opcodes(tags.raw(OPCODES_2))
+    opcodes = b"" if lossy else tags.raw(OPCODES_2)
     stated = () if lossy else tags.integers(_WHITE, 3)
     sensor_noise, cfa, remarks = None, None, list[str]()
     if mosaic is not None:
         white, clip = mosaic.saturation()
         sensor_noise, cfa, stated = mosaic.noise(white), mosaic.bayer_pattern(), ()
-        steps, lost = demosaiced(steps, cfa)
-        remarks += [f"its {step.name} is for the mosaic only and is dropped" for step in lost]
+        if opcodes:
+            opcodes = b""
+            remarks.append("what its OpcodeList2 asks of the mosaic, such as brighter corners, is dropped")
         if count := mosaic.repair():
             many = " of its sensor is" if count == 1 else "s of its sensor are"
             remarks.append(f"{count} defective pixel{many} replaced")
@@ -333,8 +334,8 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
             to_srgb=matrix3(to_srgb),
             xyz_to_camera=matrix3(xyz_to_camera),
             baseline_exposure=said.baseline_exposure(),
-            opcodes_2=packed_opcodes(steps),
-            opcodes_3=packed_opcodes(read_opcodes(tags.raw(OPCODES_3))),
+            opcodes_2=opcodes,
+            opcodes_3=tags.raw(OPCODES_3),
         ),
         sensor_noise=sensor_noise,
         coding_noise=coding_noise(said.header.coarseness, curves_of("srgb")[1]),

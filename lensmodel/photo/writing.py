@@ -1,6 +1,6 @@
 """Linear planes to files: complete or not at all, with profile and the safe part of EXIF; DNG.
 
-Source: Adobe, "Digital Negative (DNG) Specification" 1.4, 2012, and 1.6, 2021 (chapter 7: opcodes).
+Source: Adobe, "Digital Negative (DNG) Specification" 1.4, 2012, and 1.6, 2021.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias, get_args
+from typing import Any, BinaryIO, Final, TypeAlias, get_args
 
 import imagecodecs
 import numpy as np
@@ -21,7 +21,7 @@ from PIL import Image
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 from lensmodel.core.names import full_name
-from lensmodel.core.types import BayerPattern, Planes
+from lensmodel.core.types import Planes
 from lensmodel.photo.colour import (
     D65_TO_D50,
     SRGB_TO_XYZ_D65,
@@ -126,14 +126,9 @@ def write_image(
 
 def _tell_losses(name: str, planes: Planes, encoding: Encoding, output: OutputFormat) -> None:
     """Tell what of the photo a file of this format does not hold."""
-    steps = [step.name for block in (encoding.opcodes_2, encoding.opcodes_3) for step in read_opcodes(block)]
-    if steps and output != "dng":
-        remarks_log.warning(
-            "%s: the corrections that the DNG leaves to raw converters (%s) are not in it; only DNG output "
-            "keeps them",
-            name,
-            ", ".join(steps),
-        )
+    if (encoding.opcodes_2 or encoding.opcodes_3) and output != "dng":
+        said = "%s: what the DNG leaves to raw converters to correct is not in it; only DNG output keeps that"
+        remarks_log.warning(said, name)
     clipped = encoding.bit_depth == 32 and output not in {"tiff32", "dng"}
     if clipped and (beyond := 100.0 * float((planes > 1.0).mean())):
         said = "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them"
@@ -313,74 +308,3 @@ def dng_tags(
         50735: text(metadata.body_serial),  # CameraSerialNumber
         50778: shorts(21),  # CalibrationIlluminant1: D65, in the numbers of Exif's LightSource
     }
-
-
-# --- opcodes: what raw converters are to do with the image, kept for a demosaiced one --------------
-
-_OPCODES: Final = (
-    *("", "WarpRectilinear", "WarpFisheye", "FixVignetteRadial", "FixBadPixelsConstant", "FixBadPixelsList"),
-    *("TrimBounds", "MapTable", "MapPolynomial", "GainMap", "DeltaPerRow", "DeltaPerColumn", "ScalePerRow"),
-    *("ScalePerColumn", "WarpRectilinear2"),
-)
-_GAIN_MAP: Final = _OPCODES.index("GainMap")
-_GAIN_HEAD: Final = struct.Struct(">10I4dI")
-_MOST: Final = 64  # opcodes of a list (chosen): cameras write below ten
-
-
-class Opcode(NamedTuple):
-    """One step: its number, the DNG version it asks for, flags, and parameters."""
-
-    number: int
-    version: int
-    flags: int
-    data: bytes
-
-    @property
-    def name(self) -> str:
-        """Name by the specification."""
-        return _OPCODES[self.number] if 0 < self.number < len(_OPCODES) else f"opcode {self.number}"
-
-
-def read_opcodes(block: bytes) -> list[Opcode]:
-    """Take a list apart; one that is damaged gives what came before the damage."""
-    steps, at = list[Opcode](), 4
-    for _ in range(min(int.from_bytes(block[:4], "big"), _MOST)):
-        head, start = block[at : at + 16], at + 16
-        number, version, flags, size = struct.unpack(">4I", head.ljust(16, b"\xff"))
-        at = start + size
-        if at > len(block):
-            break
-        steps.append(Opcode(number, version, flags, block[start:at]))
-    return steps
-
-
-def packed_opcodes(steps: list[Opcode]) -> bytes:
-    """Put a list together; nothing for no step."""
-    body = b"".join(struct.pack(">4I", *step[:3], len(step.data)) + step.data for step in steps)
-    return struct.pack(">I", len(steps)) + body if steps else b""
-
-
-def demosaiced(steps: list[Opcode], cfa: BayerPattern | None) -> tuple[list[Opcode], list[Opcode]]:
-    """Rewrite the steps of OpcodeList2, which are for a mosaic, for planes; and those that are lost.
-
-    A gain map of every second pixel is that of a colour; each of the two of green gives its square root.
-    """
-    kept, lost = list[Opcode](), list[Opcode]()
-    for step in steps:
-        known = step.number == _GAIN_MAP and len(step.data) >= _GAIN_HEAD.size
-        head = _GAIN_HEAD.unpack_from(step.data) if known else (0,) * 15
-        (top, left, bottom, right), pitch, gains = head[:4], head[6:8], step.data[_GAIN_HEAD.size :]
-        if pitch == (2, 2) and cfa is not None:
-            colour = cfa[top % 2][left % 2]
-            if colour == 1:
-                whole = np.frombuffer(gains[: len(gains) // 4 * 4], ">f4")
-                gains = np.sqrt(np.maximum(whole, 0.0)).astype(">f4").tobytes()
-            # the two rows and columns between whose pixels the others stood
-            area = (top - top % 2, left - left % 2, bottom + bottom % 2, right + right % 2, colour, 1)
-        elif pitch == (1, 1):
-            area = (top, left, bottom, right, 0, 3)
-        else:
-            lost.append(step)
-            continue
-        kept.append(step._replace(data=_GAIN_HEAD.pack(*area, 1, 1, *head[8:]) + gains))
-    return kept, lost

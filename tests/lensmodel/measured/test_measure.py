@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import Image
 from scipy import ndimage, signal, stats
 
 from lab import targets
@@ -24,7 +24,7 @@ from lensmodel.calibration import joined
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centred
 from lensmodel.core.types import Frame, Kernel, LensSettings, NoiseModel, StepHook, ignore_step
-from lensmodel.measured.edges import SlantedEdges, squares_of
+from lensmodel.measured.edges import SlantedEdges
 from lensmodel.measured.measurer import Found, Measurer, Prepared, solve
 from lensmodel.measured.pair import AperturePair, diffraction_otf
 from lensmodel.measured.points import Points, find_lights, isolated_lights
@@ -33,7 +33,6 @@ from lensmodel.measured.target import PAPERS, Target, TargetPage
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo, PhotoMetadata
-from lensmodel.quality import find_edges
 
 SHAPE = (360, 540)
 PAIR_SHAPE = (288, 432)  # of less a pair is as good: it needs no lights and no page
@@ -205,35 +204,6 @@ def test_a_target_is_written_to_print_in_the_middle_of_its_paper(tmp_path: Path,
 def test_other_files_and_papers_are_refused(tmp_path: Path, name: str, paper: str, said: str) -> None:
     with pytest.raises(InvalidInputError, match=said):
         measure.print_target(tmp_path / name, TargetPage(300), paper=paper)
-    with pytest.raises(InvalidInputError, match=said):
-        measure.print_chart(tmp_path / name, paper=paper)
-
-
-# --- the chart of edges -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("paper", ["a4", "letter"])
-def test_a_chart_is_written_whose_squares_are_found_when_it_is_photographed(
-    tmp_path: Path, paper: str
-) -> None:
-    path = tmp_path / "squares.pdf"
-    measure.print_chart(path, paper=paper)
-    text = path.read_text("ascii")
-
-    number = r"(\d+\.\d+)"
-    width, height = map(float, re.findall(rf"MediaBox \[ 0 0 {number} {number} \]", text)[0])
-    assert (width, height) == pytest.approx([side / 25.4 * 72 for side in PAPERS[paper]], abs=0.01)
-    drawn = re.findall(rf"^{number} {number} m ((?:{number} {number} l )+)h f$", text, re.MULTILINE)
-    assert len(drawn) == 35
-    scale, fine = 3.0, 4  # pixels a point, and points drawn for each along an axis
-    picture = Image.new("L", (round(width * scale * fine), round(height * scale * fine)), 200)
-    for start in re.findall(r"^(.*) h f$", text, re.MULTILINE):
-        xy = np.array(re.findall(number, start), dtype=float).reshape(4, 2)
-        ImageDraw.Draw(picture).polygon([(x * scale * fine, (height - y) * scale * fine) for x, y in xy], 20)
-    photo = np.asarray(picture.reduce(fine), dtype=np.float32) / 255.0
-    squares = squares_of(find_edges(ndimage.gaussian_filter(photo, 1.0)))
-    assert len(squares) == 35
-    assert all(len(square) == 4 for square in squares)
 
 
 # --- registration -------------------------------------------------------------------------------

@@ -31,14 +31,7 @@ from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, matrix3, srgb_to_linear
 from lensmodel.photo.metadata import gps_directory, xmp_packet
-from lensmodel.photo.writing import (
-    XYZ_TO_SRGB,
-    Opcode,
-    demosaiced,
-    packed_opcodes,
-    read_opcodes,
-    write_bayer_dng,
-)
+from lensmodel.photo.writing import XYZ_TO_SRGB, write_bayer_dng
 
 METADATA = photo.PhotoMetadata(
     camera_maker="Canon",
@@ -492,75 +485,32 @@ def test_the_place_is_kept_where_its_owner_wants_it_and_nowhere_else(
     assert gps_directory(left) == {}
 
 
-def opcode_lists(path: Path) -> list[list[Opcode]]:
+def opcode_lists(path: Path) -> list[bytes]:
     with tifffile.TiffFile(path) as file:
         tags = file.pages[0].tags
-        return [read_opcodes(bytes(tags[tag].value)) if tag in tags else [] for tag in (51009, 51022)]
+        return [bytes(tags[tag].value) if tag in tags else b"" for tag in (51009, 51022)]
 
 
-def test_gain_map_and_warp_go_into_the_corrected_dng(tmp_path: Path) -> None:
-    ((gain,), (warp,)) = opcode_lists(corrected(REPORTS / "gainmap-warp.dng", tmp_path / "x.dng", "dng"))
-    (source,), (source_warp,) = opcode_lists(REPORTS / "gainmap-warp.dng")
+def test_a_warp_goes_into_the_corrected_dng_and_what_is_for_the_mosaic_is_said_to_be_dropped(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    source, written = (
+        REPORTS / "gainmap-warp.dng",
+        corrected(REPORTS / "gainmap-warp.dng", tmp_path / "x.dng", "dng"),
+    )
 
-    assert (warp.name, warp.data) == ("WarpRectilinear", source_warp.data)
-    assert gain.name == "GainMap"
-    assert struct.unpack(">8I", gain.data[:32]) == (0, 0, 224, 360, 0, 3, 1, 1)  # of all three planes
-    assert gain.data[32:] == source.data[32:]
+    assert "its OpcodeList2 asks of the mosaic" in caplog.text
+    assert opcode_lists(written) == [b"", opcode_lists(source)[1]]
+    # those of a linear DNG are for its planes
+    data = written.read_bytes()
+    written.write_bytes(data.replace(struct.pack("<H", 51022), struct.pack("<H", 51009)))
+    assert opcode_lists(corrected(written, tmp_path / "y.dng", "dng")) == opcode_lists(written)
 
 
 def test_a_file_that_cannot_keep_them_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     corrected(REPORTS / "gainmap-warp.dng", tmp_path / "x.tif", "tiff16")
 
-    assert "GainMap, WarpRectilinear" in caplog.text
-
-
-def gain_map(top: int, left: int, pitch: int, gains: list[float]) -> Opcode:
-    head = struct.pack(">10I4dI", top, left, 48, 64, 0, 1, pitch, pitch, 2, 2, 1.0, 1.0, 0.0, 0.0, 1)
-    return Opcode(9, 0x01030000, 1, head + struct.pack(">4f", *gains))
-
-
-@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
-def test_gain_maps_of_the_four_sites_of_a_mosaic_become_those_of_three_colours(
-    pattern: str, tmp_path: Path
-) -> None:
-    sites = [gain_map(row, col, 2, [1.0 + row, 2.0, 3.0, 4.0 + col]) for row in (0, 1) for col in (0, 1)]
-    mosaic = np.random.default_rng(0).integers(2000, 2900, (48, 64), dtype=np.uint16)
-    with_lists(
-        tmp_path / "x.dng", mosaic, pattern, packed_opcodes([*sites, Opcode(4, 0x01030000, 1, b"\0" * 8)])
-    )
-
-    kept, _ = opcode_lists(corrected(tmp_path / "x.dng", tmp_path / "out.dng", "dng"))
-
-    gains = np.ones((3, 4))  # of a plane: greens of both sites, one after the other, are their geometric mean
-    for step in kept:
-        area = struct.unpack(">8I", step.data[:32])
-        assert area[5:] == (1, 1, 1)
-        gains[area[4]] *= np.frombuffer(step.data[-16:], ">f4")
-    seen = np.array([np.frombuffer(step.data[-16:], ">f4") for step in sites], dtype=float)
-    of_green = np.array([letter == "G" for letter in pattern])
-    assert gains[1] == pytest.approx(np.sqrt(seen[of_green].prod(axis=0)), rel=1e-6)
-    assert gains[0] == pytest.approx(seen[pattern.index("R")])
-    remarks = photo.develop(tmp_path / "x.dng").remarks
-    assert remarks[0] == "its FixBadPixelsConstant is for the mosaic only and is dropped"
-
-
-def with_lists(path: Path, mosaic: np.ndarray, pattern: str, block: bytes) -> None:
-    """Write a DNG with an OpcodeList2 in the place of its XMP."""
-    write_bayer_dng(path, mosaic, black=512, white=15000, pattern=pattern)
-    data = bytearray(path.read_bytes())
-    at = next(i for i in range(10, 600, 12) if data[i : i + 2] == struct.pack("<H", 50708))
-    data[at : at + 12] = struct.pack("<HHII", 51009, 7, len(block), len(data))
-    path.write_bytes(bytes(data) + block)
-
-
-@pytest.mark.parametrize("cut", [0, 3, 4, 19, 30, 410])
-def test_a_damaged_list_gives_what_came_before_the_damage(cut: int) -> None:
-    with tifffile.TiffFile(REPORTS / "gainmap-warp.dng") as file:
-        block = bytes(file.pages[0].tags[51009].value)
-
-    assert read_opcodes(block[:cut]) == []
-    assert len(read_opcodes(struct.pack(">I", 2**32 - 1) + block[4:])) == 1
-    assert demosaiced([Opcode(9, 0, 0, block[20:60])], None)[0] == []
+    assert "only DNG output keeps that" in caplog.text
 
 
 @pytest.mark.parametrize("output", [*FORMATS, "tiff32"])

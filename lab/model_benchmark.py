@@ -33,7 +33,7 @@ from lensmodel.core.types import (
     ignore_step,
     zone_of,
 )
-from lensmodel.model import LensModel, ModelSettings, query
+from lensmodel.model import LensModel, query
 from lensmodel.model.bandwidths import reference_bandwidth
 from lensmodel.model.query import MODES
 from lensmodel.simulate import draw_lens
@@ -186,9 +186,9 @@ def run_model_benchmark(
     return compared([(seed, draw_lens(seed).field()) for seed in seeds], fits, photos, on_step)
 
 
-def _regression(chosen: ModelSettings) -> Fit:
+def _regression(mode: str) -> Fit:
     def fit(_: PsfField, samples: Sequence[PsfSample]) -> Predictor:
-        model, settings = LensModel.fit(samples, chosen), samples[0].settings
+        model, settings = LensModel.fit(samples, mode), samples[0].settings
         return lambda place: model.query(place, settings, SIZE).kernel
 
     return fit
@@ -232,7 +232,7 @@ FITS: Final[Mapping[str, Fit]] = {
     "eff-linear": _linear,
     "polynomial": _polynomial,
     "paper": _paper,
-    **{f"mode-{mode}": _regression(ModelSettings(mode=mode)) for mode in MODES},
+    **{f"mode-{mode}": _regression(mode) for mode in MODES},
 }
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, field_grid
     from lensmodel.correction import Bounds, Corrected, Deconvolver, Sensor, deconvolvers
     from lensmodel.lens import Lens
-    from lensmodel.model import ModelSettings, PsfAnswer
+    from lensmodel.model import PsfAnswer
     from lensmodel.patches import Selector, selectors
     from lensmodel.photo import LinearPhoto, develop
     from lensmodel.photo.development import photo_from_array
@@ -48,7 +48,6 @@ __all__ = [
     "LensModelError",
     "LensSettings",
     "LinearPhoto",
-    "ModelSettings",
     "NoiseModel",
     "PsfAnswer",
     "PsfEstimate",
@@ -77,7 +76,7 @@ _HOMES: Final = {
     "lensmodel.photo": ("LinearPhoto", "develop"),
     "lensmodel.blind.sampling": ("CalibrationEvent",),
     "lensmodel.core.psf": ("PsfSample",),
-    "lensmodel.model": ("ModelSettings", "PsfAnswer"),
+    "lensmodel.model": ("PsfAnswer",),
     "lensmodel.core.types": ("FieldPosition", "LensSettings", "NoiseModel", "field_grid"),
 }
 """Where each public name is defined."""

@@ -38,7 +38,7 @@ from lensmodel.core.errors import (
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import Channel, FieldPosition, Frame, LensSettings, StepHook, ignore_step
 from lensmodel.lens import Lens
-from lensmodel.model import LensModel, ModelField, ModelSettings
+from lensmodel.model import LensModel, ModelField
 from lensmodel.model.camera_bodies import ALIKE, circle_mm
 from lensmodel.model.query import PAPER
 from lensmodel.patches import Selector
@@ -73,7 +73,7 @@ def calibrate(
     focus_m: float | None = None,
     estimator: str | PsfEstimator | None = None,
     selector: str | Selector = "r-map",
-    model: str | ModelSettings | None = None,
+    model: str | None = None,
     kernel_size: int | None = None,
     any_lens: bool = False,
     patches: int | None = None,
@@ -100,9 +100,9 @@ def calibrate(
         class in a notebook, runs in threads of this process. None takes that of `model`.
     selector : str or Selector
         A name in `selectors`, or an object of one's own.
-    model : {"default", "paper"} or ModelSettings, optional
+    model : {"default", "paper"}, optional
         "paper" learns a new lens the paper's own way, and corrects with it so: to compare with, not for
-        photos to keep. Or the choices of the regression. A lens that is given keeps its own.
+        photos to keep. A lens that is given keeps its own.
     kernel_size : int, optional
         Largest odd side of the estimated kernels in pixels, 3 to 55; by default 55, of an own estimator 31.
     any_lens : bool
@@ -134,10 +134,8 @@ def calibrate(
         path.stat()
     if lens is not None and model is not None:
         raise InvalidInputError("the lens has a model of its own; give lens or model, not both")
-    begin = model if isinstance(model, ModelSettings) else None
-    mode = begin.mode if begin else "default" if lens is None else lens.model.mode
     config = configured(
-        model if isinstance(model, str) else mode,
+        model or ("default" if lens is None else lens.model.mode),
         LensSettings(aperture, focal_mm, focus_m),
         estimator=estimator,
         kernel_size=kernel_size,
@@ -146,7 +144,7 @@ def calibrate(
     )
     reasons = []
     with processes.pool(None, workers, estimators.resolve(config.estimator)) as pool:
-        calibration = Calibration(LensStore(lens), config, begin=begin, any_lens=any_lens, pool=pool)
+        calibration = Calibration(LensStore(lens), config, any_lens=any_lens, pool=pool)
         for event in calibration.learn(paths, executor, on_event=on_event):
             if event.error is not None:
                 reasons.append(f"{event.photo.name}: {event.detail}")

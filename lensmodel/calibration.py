@@ -26,7 +26,7 @@ from lensmodel.core import processes
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError
 from lensmodel.core.psf import PsfSample
 from lensmodel.lens import Lens
-from lensmodel.model import LensModel, LensProfile, ModelSettings
+from lensmodel.model import LensModel, LensProfile
 from lensmodel.model.profile import Identity, difference
 from lensmodel.photo import PhotoMetadata
 from lensmodel.photo.values import CORRECTED
@@ -59,8 +59,8 @@ Sampler = Callable[[str, Admit], Sequence[PsfSample]]
 class Calibration:
     """A lens that learns from one photo after the other, kept in a store.
 
-    `begin` are the choices of the regression of a new lens; `pool` estimates the cells of all photos;
-    `replace` drops what was learned blindly at the settings of new, measured samples.
+    `pool` estimates the cells of all photos; `replace` drops what was learned blindly at the settings of new,
+    measured samples.
     """
 
     def __init__(
@@ -68,13 +68,11 @@ class Calibration:
         store: LensStore,
         config: Config,
         *,
-        begin: ModelSettings | None = None,
         any_lens: bool = False,
         replace: bool = False,
         pool: Executor | None = None,
     ) -> None:
         self._store, self._config = store, config
-        self._begin = begin or ModelSettings(mode=config.model)
         self._any_lens, self._replace, self._pool = any_lens, replace, pool
 
     @property
@@ -128,7 +126,7 @@ class Calibration:
         lens, identity = self.known, identities[0]
         self._require_same(lens, identity)
         if lens is None:
-            known = LensProfile(LensModel.fit(samples, self._begin))
+            known = LensProfile(LensModel.fit(samples, self._config.model))
         else:
             model = joined(lens.model, samples, replace=self._replace)
             known = dataclasses.replace(lens.profile, model=model)
@@ -189,7 +187,7 @@ def joined(model: LensModel, samples: Sequence[PsfSample], *, replace: bool = Fa
     if not replace:
         return model.added(samples)
     kept = [old for old in model.samples if old.measured or not any(_alike(old, new) for new in samples)]
-    return LensModel.fit([*kept, *samples], model.settings)
+    return LensModel.fit([*kept, *samples], model.mode)
 
 
 def _alike(old: PsfSample, new: PsfSample) -> bool:

@@ -15,7 +15,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.names import full_name
 from lensmodel.core.psf import PsfSample, centred
 from lensmodel.core.types import Channel, FieldPosition, LensSettings, field_grid
-from lensmodel.model import LensModel, LensProfile, ModelSettings, PsfAnswer, load_profile, save_profile
+from lensmodel.model import LensModel, LensProfile, PsfAnswer, load_profile, save_profile
 from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
 
 
@@ -69,7 +69,6 @@ class Lens:
         weight: ArrayLike = 1.0,
         photo: str | Sequence[str] = "",
         pixel_pitch_um: float | None = None,
-        model: ModelSettings | None = None,
     ) -> Lens:
         """Make a PSF field of kernels that were measured in any way, at n places.
 
@@ -85,8 +84,6 @@ class Lens:
             0..1, which scales its part in answers; what it was measured on, whose faults its kernels share.
         pixel_pitch_um : float, optional
             Pixels of the kernels in micrometres, so that sensors with other pixels may ask.
-        model : ModelSettings, optional
-            Choices of the regression.
 
         Raises
         ------
@@ -114,7 +111,7 @@ class Lens:
             )
             for kernel, radius, angle, f_number, color, sure, name in zip(stack, *columns, strict=True)
         ]
-        return cls(LensProfile(LensModel.fit(samples, model)))
+        return cls(LensProfile(LensModel.fit(samples)))
 
     @classmethod
     def load(cls, path: Path | str) -> Lens:

@@ -33,7 +33,7 @@ from app.jobs.sample_files import read_samples, write_samples
 from app.sandbox.child import ProgressHook, Task
 from lensmodel import api, correction, photo
 from lensmodel import measured as lens_measure
-from lensmodel.blind import estimators, sampling
+from lensmodel.blind import sampling
 from lensmodel.core.errors import ImageTooLargeError, LensModelError
 from lensmodel.core.files import from_json, to_json
 from lensmodel.core.names import camera_name
@@ -41,7 +41,7 @@ from lensmodel.core.types import FieldPosition, LensSettings, Planes
 from lensmodel.model import LensModel
 from lensmodel.model.profile import read_profile
 from lensmodel.neural import FieldNetwork
-from lensmodel.patches import Patch, selectors
+from lensmodel.patches import Patch
 from lensmodel.patches.select import Rejection
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.photo.metadata import find_location
@@ -278,15 +278,13 @@ def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     cameras = sorted({camera_name(camera.maker, camera.model) for camera in read.cameras} - {""})
     # of the cameras the service asks only whether there is one
     named = {"photos": read.photos, "lens": read.lens, "cameras": cameras[:2]}
-    return {"mode": read.model.settings.mode, "samples": len(samples), **named}
+    return {"mode": read.model.mode, "samples": len(samples), **named}
 
 
 _NAMED: Final = (locate, inspect, develop, select, estimate, correct, measure, measure_lens, profile)
 TASKS: Final[Mapping[str, Task]] = {task.__name__.replace("_", "-"): task for task in _NAMED}
 
-for _registry in (estimators, selectors, correction.deconvolvers):
-    _registry.load_installed()  # in the fork server: a confined child may no longer read their files
-FieldNetwork.load()  # nor the weights, which all children share
+FieldNetwork.load()  # in the fork server: a confined child may no longer read the weights, which all share
 
 
 def _window(window: Patch | Rejection, place: FieldPosition) -> dict[str, Any]:

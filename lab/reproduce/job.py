@@ -32,7 +32,7 @@ from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Kernel, LensSettings, Planes
 from lensmodel.correction import correct_planes
-from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto, develop
 
 CROP_PX: Final = 128  # side of a crop in a strip (chosen)
@@ -264,8 +264,9 @@ class Learner:
             samples = sampling.samples_of_photo(photo, self._way, workers=self._workers)
         except LensModelError as error:
             return str(error)
-        chosen = ModelSettings(mode=self._way.model)
-        self.model = LensModel.fit(samples, chosen) if self.model is None else self.model.added(samples)
+        self.model = (
+            LensModel.fit(samples, self._way.model) if self.model is None else self.model.added(samples)
+        )
         return ""
 
     def answers(

@@ -6,7 +6,7 @@ from lensmodel.blind.patch_recurrence import PatchRecurrence
 from lensmodel.core.registry import Registry
 
 estimators: Registry[PsfEstimator] = Registry(
-    "estimator", {"default": LearnedEstimator, "michaeli-irani": PatchRecurrence}, "lensmodel.estimators"
+    "estimator", {"default": LearnedEstimator, "michaeli-irani": PatchRecurrence}
 )
 
 __all__ = ["PatchRecurrence", "PhotoEstimator", "PsfEstimate", "PsfEstimator", "estimators"]

@@ -60,7 +60,6 @@ deconvolvers: Registry[Deconvolver] = Registry(
         "paper": partial(SaturationAwareRichardsonLucy, warped=True),  # section 7
         "fast": DirectFilter,
     },
-    "lensmodel.deconvolvers",
 )
 """The deconvolution methods by name."""
 

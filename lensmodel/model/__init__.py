@@ -2,15 +2,6 @@
 
 from lensmodel.model.lens_model import LensModel, ModelField
 from lensmodel.model.profile import Camera, LensProfile, load_profile, save_profile
-from lensmodel.model.query import ModelSettings, PsfAnswer
+from lensmodel.model.query import PsfAnswer
 
-__all__ = [
-    "Camera",
-    "LensModel",
-    "LensProfile",
-    "ModelField",
-    "ModelSettings",
-    "PsfAnswer",
-    "load_profile",
-    "save_profile",
-]
+__all__ = ["Camera", "LensModel", "LensProfile", "ModelField", "PsfAnswer", "load_profile", "save_profile"]

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import query
-from lensmodel.model.query import PAPER, ModelSettings
+from lensmodel.model.query import PAPER
 
 FALLBACK: Final[Mapping[str, float]] = {
     "aperture_stops": 0.5,
@@ -66,9 +66,9 @@ def reference_bandwidth(sigma: float, dimensions: int, count: int) -> float:
 
 
 def bandwidths(
-    where: NDArray[np.float64], settings: ModelSettings, factors: tuple[float, float] = (1.0, 1.0)
+    where: NDArray[np.float64], mode: str, factors: tuple[float, float] = (1.0, 1.0)
 ) -> dict[str, float]:
-    """Bandwidths of points `(n, 7)` by eq. (8), factors on r and phi, and the wishes of a user.
+    """Bandwidths of points `(n, 7)` by eq. (8), and factors on r and phi.
 
     n counts PSF samples of one channel, not their pixels: a million pixels of one PSF say nothing
     about another place. d counts the place and those settings that vary. (u, v) have none.
@@ -79,14 +79,13 @@ def bandwidths(
     varying = {name: sigma for name, sigma in spread.items() if sigma > _SAME}
     d = 2 + len(varying)
     # the paper's own way is eq. (8) as it stands
-    whole = _PLACE_SHARE if settings.mode == PAPER else 1.0
+    whole = _PLACE_SHARE if mode == PAPER else 1.0
     r, phi = (
         max(_PLACE_SHARE * reference_bandwidth(sigma, d, n), floor) / whole
         for sigma, floor in ((float(where[:, 0].std()), _FLOOR_R), (math.sqrt(0.5), _FLOOR_PHI))
     )
     rule = {name: min(FALLBACK[name], reference_bandwidth(sigma, d, n)) for name, sigma in varying.items()}
-    rule = {"r": settings.r or r * factors[0], "phi": settings.phi or phi * factors[1], **FALLBACK, **rule}
-    return rule if settings.stops is None else {**rule, "aperture_stops": settings.stops}
+    return {"r": r * factors[0], "phi": phi * factors[1], **FALLBACK, **rule}
 
 
 class HeldOut:
@@ -138,8 +137,8 @@ class HeldOut:
         errors = self.errors(self.weights(r, phi))
         return float(np.average(np.minimum(errors, _CAP), weights=np.maximum(self.claims, 1e-9)))
 
-    def best_factors(self, *, r: bool, phi: bool) -> tuple[float, float]:
-        """Search the factors on r and phi, each only where it is free, for the least held-out error."""
+    def best_factors(self) -> tuple[float, float]:
+        """Search the factors on r and phi, by turns, for the least held-out error."""
 
         def best(options: list[tuple[float, float]]) -> tuple[float, float]:
             # the least reach among those that are as good: far neighbours cost time and trust in a symmetry
@@ -150,10 +149,8 @@ class HeldOut:
         chosen = (1.0, 1.0)
         for _ in range(2):
             before = chosen
-            if r:
-                chosen = best([(factor, chosen[1]) for factor in MULTIPLES])
-            if phi:
-                chosen = best([(chosen[0], factor) for factor in PHI_MULTIPLES])
+            chosen = best([(factor, chosen[1]) for factor in MULTIPLES])
+            chosen = best([(chosen[0], factor) for factor in PHI_MULTIPLES])
             if chosen == before:
                 break
         return chosen
@@ -204,15 +201,15 @@ class CrossValidation:
 
 def cross_validate(
     samples: Sequence[PsfSample],
-    settings: ModelSettings,
+    mode: str,
     upright: Callable[[NDArray[np.intp]], NDArray[np.float64]],
     where: NDArray[np.float64],
     base: NDArray[np.float64],
 ) -> CrossValidation:
     """Choose bandwidths by cross-validation, weigh samples robustly; `upright` gives the kernels of rows."""
-    paper = settings.mode == PAPER
+    paper = mode == PAPER
     photo = np.unique([s.photo for s in samples], return_inverse=True)[1]
-    groups, scale = _held_together(photo, where[:, 5]), query.scales(bandwidths(where, settings))
+    groups, scale = _held_together(photo, where[:, 5]), query.scales(bandwidths(where, mode))
     counting = np.flatnonzero(base > 0)
     automatic = not paper and len(np.unique(photo[counting])) >= _CV_PHOTOS
     searched = _thinned(counting[_judging(where[counting, 4])], _CV_SAMPLES)
@@ -228,7 +225,7 @@ def cross_validate(
     def searched_factors(weights: NDArray[np.float64]) -> tuple[float, float]:
         if not automatic:
             return 1.0, 1.0
-        return held(searched, weights).best_factors(r=settings.r is None, phi=settings.phi is None)
+        return held(searched, weights).best_factors()
 
     factors, weights = searched_factors(base), base
     prepared = held(scored, base)

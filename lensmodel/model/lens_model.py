@@ -11,12 +11,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.errors import InvalidInputError, NoSamplesError
+from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone, zone_of
 from lensmodel.model import camera_bodies
 from lensmodel.model.learned_field import LearnedField
-from lensmodel.model.query import PAPER, VARIABLES, AnsweredBy, ModelSettings, PsfAnswer
+from lensmodel.model.query import MODES, PAPER, VARIABLES, AnsweredBy, PsfAnswer
 from lensmodel.model.regression import Regression
 
 _LEAST_ERROR: Final = 0.01  # relative L2 below which no part of an answer is believed (chosen)
@@ -38,23 +38,23 @@ class LensModel:
     In the mode "paper" all kernels are averaged by the regression and nothing else is done.
     """
 
-    def __init__(
-        self, samples: tuple[PsfSample, ...], settings: ModelSettings, before: Regression | None = None
-    ) -> None:
+    def __init__(self, samples: tuple[PsfSample, ...], mode: str, before: Regression | None = None) -> None:
+        if mode not in MODES:
+            raise UnknownMethodError(f"no mode {mode!r} of the lens model; choose one of {', '.join(MODES)}")
         if not samples:
             raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
-        self.samples, self.settings = samples, settings
-        encoded, kernels = _parted(samples, settings)
+        self.samples, self.mode = samples, mode
+        encoded, kernels = _parted(samples, mode)
         self._attention = LearnedField(encoded) if encoded else None
         self._regression = before if before is not None and before.samples == kernels else None
         if kernels and self._regression is None:
-            self._regression = Regression(kernels, settings)
+            self._regression = Regression(kernels, mode)
         self._answering = [part for part in (self._attention, self._regression) if part is not None]
 
     @classmethod
-    def fit(cls, samples: Sequence[PsfSample], settings: ModelSettings | None = None) -> LensModel:
+    def fit(cls, samples: Sequence[PsfSample], mode: str = "default") -> LensModel:
         """Build a model from samples; one of a photo and place that is there already is not counted again."""
-        return cls(_distinct(camera_bodies.on_one_circle(samples)), settings or ModelSettings())
+        return cls(_distinct(camera_bodies.on_one_circle(samples)), mode)
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
         """Return the model with more samples; a regression is fitted anew where these are of its kind."""
@@ -62,7 +62,7 @@ class LensModel:
         every = _distinct(placed, known=len(self.samples))
         if len(every) == len(self.samples):
             return self
-        return LensModel(every, self.settings, self._regression)
+        return LensModel(every, self.mode, self._regression)
 
     def query(
         self,
@@ -126,11 +126,6 @@ class LensModel:
         if pitch_um is not None and not (math.isfinite(pitch_um) and pitch_um > 0):
             raise InvalidInputError(f"the pixel pitch must be positive micrometres, got {pitch_um}")
         return self.pitch_um if pitch_um is None else pitch_um
-
-    @property
-    def mode(self) -> str:
-        """Which of `query.MODES` answers."""
-        return self.settings.mode
 
     @property
     def weights(self) -> str:
@@ -197,9 +192,9 @@ class ModelField:
         return self.model.query(position, settings, size, pitch_um=self.pitch_um)
 
 
-def _parted(samples: Sequence[PsfSample], settings: ModelSettings) -> tuple[list[PsfSample], list[PsfSample]]:
+def _parted(samples: Sequence[PsfSample], mode: str) -> tuple[list[PsfSample], list[PsfSample]]:
     """One sample of each encoded patch, and those whose kernels are averaged."""
-    if settings.mode == PAPER:
+    if mode == PAPER:
         return [], list(samples)
     encoded: dict[Hashable, PsfSample] = {}
     for sample in samples:

@@ -34,7 +34,6 @@ from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.psf import EncodedPatch, PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model.lens_model import LensModel
-from lensmodel.model.query import ModelSettings
 from lensmodel.photo import PhotoMetadata
 
 FORMAT = 2  # raised when samples of before mean nothing to the model any more
@@ -99,7 +98,7 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
         "lens": profile.lens,
         "photos": profile.photos,
         "cameras": [{key: text for key, text in of.items() if text is not None} for of in cameras],
-        "model": asdict(profile.model.settings),
+        "model": {"mode": profile.model.mode},
         "samples": packed.entries,
     }
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -155,10 +154,10 @@ def read_profile(source: Path | str | IO[bytes], name: str) -> LensProfile:
                 f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
-        chosen = dict(document["model"])
-        excluded = chosen.pop("excluded", ())  # photos that do not count, of earlier profiles
+        chosen = document["model"]
+        excluded = chosen.get("excluded", ())  # photos that do not count, of earlier profiles
         samples = unpack_samples(PackedSamples(entries, stack, encoded))
-        model = LensModel.fit([s for s in samples if s.photo not in excluded], ModelSettings(**chosen))
+        model = LensModel.fit([s for s in samples if s.photo not in excluded], chosen.get("mode", "default"))
         cameras = (_texts(camera) for camera in document.get("cameras", []))
         return LensProfile(
             model,

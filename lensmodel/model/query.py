@@ -28,7 +28,6 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, Kernel, LensSettings
 
@@ -120,55 +119,10 @@ class Support:
 # --- what is asked and answered ------------------------------------------------------------------
 
 PAPER: Final = "paper"
-MODES: Final = ("default", PAPER)  # ways to answer from samples, see `ModelSettings.mode`
+MODES: Final = ("default", PAPER)  # ways to answer from samples, see `LensModel`
 
 AnsweredBy: TypeAlias = Literal["network", "regression", "network and regression", "paper"]
 """What made an answer."""
-
-
-@dataclass(frozen=True, slots=True)
-class ModelSettings:
-    """Choices of the model [1]_; None means automatic.
-
-    Parameters
-    ----------
-    r, phi, stops : float or None
-        Bandwidths of the regression in half-diagonals, chord of the unit circle, and stops. Automatic:
-        eq. (8) of the paper [1]_, and from three photos on the factors on it with the least
-        leave-one-photo-out error.
-    mode : {"default", "paper"}
-        "default": attention over the encoded patches of photos, and regression over the samples that were
-        measured or estimated otherwise, each with the weight of its expected error. "paper": the regression
-        of the paper over all kernels and nothing else, to compare with.
-
-    Raises
-    ------
-    InvalidInputError
-        If a value is out of its range.
-    UnknownMethodError
-        If there is no such mode.
-
-    References
-    ----------
-    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6.2.
-    """
-
-    r: float | None = None
-    phi: float | None = None
-    stops: float | None = None
-    mode: str = "default"
-
-    def __post_init__(self) -> None:
-        for name in ("r", "phi", "stops"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise InvalidInputError(
-                    f"bandwidth {name} must be positive, or None for automatic, got {value}"
-                )
-        if self.mode not in MODES:
-            raise UnknownMethodError(
-                f"no mode {self.mode!r} of the lens model; choose one of {', '.join(MODES)}"
-            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -50,7 +50,7 @@ from lensmodel.core.psf import PsfSample, resized, second_moments
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, query
 from lensmodel.model.bandwidths import bandwidths, cross_validate
-from lensmodel.model.query import PAPER, ModelSettings, Part
+from lensmodel.model.query import PAPER, Part
 
 _REACH: Final = 5.0  # bandwidths: a Gaussian has fallen to 4e-6 there
 _DROPPED: Final = 3e-5  # samples that together weigh less are left out (chosen: below single precision)
@@ -111,7 +111,7 @@ class Neighbourhood:
 class Regression:
     """Kernels of samples, prepared for questions; `NoSamplesError` if no sample has a weight."""
 
-    def __init__(self, samples: Sequence[PsfSample], settings: ModelSettings) -> None:
+    def __init__(self, samples: Sequence[PsfSample], mode: str) -> None:
         base = np.array([s.weight for s in samples])
         if not (base > 0).any():
             raise NoSamplesError(f"none of the {len(samples)} samples has a weight; include a photo again")
@@ -119,14 +119,14 @@ class Regression:
         self._pitch_um = camera_bodies.usual_pitch(samples)  # that all kernels are brought to, or None
         common = camera_bodies.at_pitch(samples, self._pitch_um)
         points = query.points(common)
-        self._widths = WidthField() if settings.mode == PAPER else WidthField.fit(common, base)
+        self._widths = WidthField() if mode == PAPER else WidthField.fit(common, base)
         self._local = LocalKernels.of(common, points, self._widths)
-        self._validation = cross_validate(common, settings, self._local.upright, points, base)
+        self._validation = cross_validate(common, mode, self._local.upright, points, base)
         self._where = query.all_in_units(common)
         # what the estimators expect of their samples; 0 where they expect nothing
         self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
         self._photos = np.array([s.photo for s in samples], dtype=object)
-        self.bandwidth = bandwidths(points, settings, self._validation.factors)
+        self.bandwidth = bandwidths(points, mode, self._validation.factors)
         self._around = Neighbourhood(points, self._validation.weights, query.scales(self.bandwidth))
 
     def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:

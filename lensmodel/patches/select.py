@@ -103,7 +103,7 @@ class Selector(Protocol):
 
 
 selectors: Registry[Selector] = Registry(
-    "patch selector", {"r-map": RMapSelector, "good-regions": GoodRegionsSelector}, "lensmodel.selectors"
+    "patch selector", {"r-map": RMapSelector, "good-regions": GoodRegionsSelector}
 )
 
 

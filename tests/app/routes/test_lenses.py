@@ -24,7 +24,7 @@ from app.store import LensName, Store
 from app.store.tables import SampleRow
 from lensmodel.core.psf import centroid, rms_width
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile, ModelSettings
+from lensmodel.model import LensModel, LensProfile
 from lensmodel.model.profile import Camera, read_profile, write_profile
 from lensmodel.model.query import PAPER
 
@@ -373,7 +373,7 @@ def test_a_profile_is_not_read_beside_the_keys_of_the_database(
 @pytest.mark.usefixtures("reading")
 def test_a_profile_of_another_model_is_refused(client: TestClient, learned: str, profile: bytes) -> None:
     samples = read_profile(io.BytesIO(profile), "The answer").model.samples
-    paper = LensModel.fit(samples, ModelSettings(mode=PAPER))
+    paper = LensModel.fit(samples, PAPER)
 
     job, _ = put_profile(client, learned, changed(profile, model=paper))
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lab.kernels import distance, gaussian
 from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, rms_width
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
+from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.model.learned_field import NEAREST
 from lensmodel.neural import FieldAnswer, FieldNetwork
 
@@ -185,7 +185,7 @@ def test_measured_kernels_count_by_the_error_that_they_expect(network: SmallNetw
 
 
 def test_kernels_of_single_patches_feed_the_regression_of_the_paper(network: SmallNetwork) -> None:
-    answer = LensModel.fit(photo("a", 1), ModelSettings(mode="paper")).query(PLACES[1], F2, 31)
+    answer = LensModel.fit(photo("a", 1), "paper").query(PLACES[1], F2, 31)
 
     assert (answer.answered_by, answer.weights) == ("paper", "")
     assert rms_width(answer.kernel) == pytest.approx(2.0, rel=0.1)

@@ -12,7 +12,7 @@ import pytest
 from lab.kernels import gaussian
 from lensmodel.core.psf import PsfSample, rms_width
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
-from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model import LensModel
 from lensmodel.report.centring import EDGE_R, Asymmetry, _verdict, centring
 from lensmodel.simulate import SimulatedLens, draw_lens
 
@@ -51,7 +51,7 @@ def true_samples(lens: SimulatedLens, photos: int, cells: tuple[int, int] = (3, 
 
 def quick(samples: list[PsfSample]) -> LensModel:
     """A model that is made fast: the centring is judged by the samples, whatever smooths them."""
-    return LensModel.fit(samples, ModelSettings(r=0.2, phi=0.5, mode="paper"))
+    return LensModel.fit(samples, "paper")
 
 
 def aligned(kind: str, decentred: tuple[float, float] = (0.0, 0.0)) -> SimulatedLens:

@@ -32,9 +32,12 @@ import numpy as np
 from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo.containers import MAX_BLOCK_BYTES, Header, opened_header, png_chunks
 from lensmodel.photo.tiff import (
+    ASCII,
     ENTRY,
     EXIF,
     GPS,
+    RATIONAL,
+    SHORT,
     SUB_DIRECTORIES,
     UNDEFINED,
     Buffer,
@@ -43,9 +46,6 @@ from lensmodel.photo.tiff import (
     TiffReader,
     Value,
     Written,
-    rationals,
-    shorts,
-    text,
 )
 from lensmodel.photo.values import SOFTWARE, LensIdentity, Limits, PhotoMetadata, SerialSource
 
@@ -373,7 +373,8 @@ def read_xmp(packet: bytes | None) -> Mapping[str, str]:
 _PACKET: Final = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF{spaces}>
 <rdf:Description rdf:about=""{properties}>
-{lists}
+<xmpMM:History><rdf:Seq><rdf:li{done}/></rdf:Seq></xmpMM:History>
+<dc:subject><rdf:Bag>{words}</rdf:Bag></dc:subject>
 </rdf:Description></rdf:RDF></x:xmpmeta>
 <?xpacket end="r"?>"""
 _CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF), " "))
@@ -388,61 +389,56 @@ def xmp_packet(metadata: PhotoMetadata, description: str, lens: str = "") -> byt
         return "".join(f" {name}={quoteattr(value.translate(_CHARACTERS))}" for name, value in known.items())
 
     done = {"stEvt:action": "filtered", "stEvt:softwareAgent": SOFTWARE, "stEvt:parameters": description}
-    lists = [f"<xmpMM:History><rdf:Seq><rdf:li{attributes(done)}/></rdf:Seq></xmpMM:History>"]
-    for name, kind, items in (
-        ("dc:rights", "Alt", [metadata.copyright]),
-        ("dc:creator", "Seq", [metadata.artist]),
-        ("dc:subject", "Bag", metadata.keywords),
-        ("dc:description", "Alt", [description]),
-    ):
-        default = ' xml:lang="x-default"' if kind == "Alt" else ""
-        texts = [escape(item.translate(_CHARACTERS)) for item in items if item]
-        written = "".join(f"<rdf:li{default}>{item}</rdf:li>" for item in texts)
-        if written:
-            lists.append(f"<{name}><rdf:{kind}>{written}</rdf:{kind}></{name}>")
     named = lens or metadata.lens.model
     known = {"xmp:CreatorTool": SOFTWARE, "xmp:Rating": metadata.rating, "aux:Lens": named}
-    spaces = attributes({f"xmlns:{prefix}": space for space, prefix in _SPACES.items()})
-    packet = _PACKET.format(spaces=spaces, properties=attributes(known), lists="\n".join(lists))
+    packet = _PACKET.format(
+        spaces=attributes({f"xmlns:{prefix}": space for space, prefix in _SPACES.items()}),
+        properties=attributes(known),
+        done=attributes(done),
+        words="".join(
+            f"<rdf:li>{escape(word.translate(_CHARACTERS))}</rdf:li>" for word in metadata.keywords
+        ),
+    )
     return packet.encode()
 
 
 # --- as EXIF tags of a written file -------------------------------------------------------------
 
 
-def written_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Value | Written | None]:
+def written_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Value | Written]:
     """Tags with those of EXIF: no maker notes, and serials only where the metadata have them.
 
     Names of people are UTF-8, as most programs read them.
     """
-    taken_at = text(metadata.taken_at.strftime("%Y:%m:%d %H:%M:%S")) if metadata.taken_at else None
-    pitch = metadata.pixel_pitch_um
-    per_cm = None if pitch is None else rationals(10_000.0 / pitch)
-    exif = {
-        0x829A: rationals(metadata.exposure_s),
-        0x829D: rationals(metadata.aperture),
-        0x8827: None if metadata.iso is None else shorts(min(round(metadata.iso), 65535)),
+    taken_at = ASCII, f"{metadata.taken_at:%Y:%m:%d %H:%M:%S}" if metadata.taken_at else None
+    pitch, iso = metadata.pixel_pitch_um, metadata.iso
+    per_cm = RATIONAL, pitch and 10_000.0 / pitch
+    exif: dict[int, Value | Written] = {
+        0x829A: (RATIONAL, metadata.exposure_s),
+        0x829D: (RATIONAL, metadata.aperture),
+        0x8827: (SHORT, iso and min(round(iso), 65535)),
         0x9000: (UNDEFINED, b"0232"),  # ExifVersion
         0x9003: taken_at,
-        0x9206: rationals(metadata.focus_m),
-        0x920A: rationals(metadata.focal_mm),
+        0x9206: (RATIONAL, metadata.focus_m),
+        0x920A: (RATIONAL, metadata.focal_mm),
         0xA20E: per_cm,  # FocalPlaneXResolution
         0xA20F: per_cm,
-        0xA210: per_cm and shorts(3),  # per centimetre
-        0xA431: text(metadata.body_serial),
-        0xA433: text(metadata.lens.maker),
-        0xA434: text(metadata.lens.model),
-        0xA435: text(metadata.lens.serial),
+        0xA210: (SHORT, pitch and 3),  # per centimetre
+        0xA431: (ASCII, metadata.body_serial),
+        0xA433: (ASCII, metadata.lens.maker),
+        0xA434: (ASCII, metadata.lens.model),
+        0xA435: (ASCII, metadata.lens.serial),
     }
+    artist, owner = ((name or "").encode() for name in (metadata.artist, metadata.copyright))
     return {
-        0x010E: text(description),
-        0x010F: text(metadata.camera_maker),
-        0x0110: text(metadata.camera_model),
-        0x0112: shorts(metadata.orientation),
-        0x0131: text(SOFTWARE),
+        0x010E: (ASCII, description),
+        0x010F: (ASCII, metadata.camera_maker),
+        0x0110: (ASCII, metadata.camera_model),
+        0x0112: (SHORT, metadata.orientation),
+        0x0131: (ASCII, SOFTWARE),
         0x0132: taken_at,
-        0x013B: text(metadata.artist, "utf-8"),
-        0x8298: text(metadata.copyright, "utf-8"),
+        0x013B: (ASCII, artist and artist + b"\0"),
+        0x8298: (ASCII, owner and owner + b"\0"),
         EXIF: exif,
     }
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import mmap
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import BinaryIO, Final, TypeAlias
@@ -40,7 +40,6 @@ _FORMATS: Final[Mapping[int, str]] = {
 }  # fmt: skip
 _SIZES: Final = {kind: struct.calcsize("=" + code) for kind, code in _FORMATS.items()}
 _VERSIONS: Final = {42, 0x55, 0x4F52, 0x5352}  # TIFF, Panasonic RW2, and two of Olympus ORF
-_MAX_UINT32: Final = 2**32 - 1  # largest number of a LONG; as a distance, infinity
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,44 +165,11 @@ class TiffReader:
 
 # --- writing -----------------------------------------------------------------------------------
 
-Value: TypeAlias = tuple[int, bytes]
-"""Type and bytes of a tag to be written, little-endian."""
+Value: TypeAlias = "tuple[int, bytes | str | float | Sequence[float] | None]"
+"""Type and value of a tag to be written: text, one number or several, or their bytes, little-endian."""
 
-Written: TypeAlias = Mapping[int, "Value | Written | None"]
+Written: TypeAlias = Mapping[int, "Value | Written"]
 """Tags of a directory to be written, such as others below it; what is `None` or empty is left out."""
-
-
-def shorts(*values: int) -> Value:
-    """Numbers of 16 bits."""
-    return SHORT, struct.pack(f"<{len(values)}H", *values)
-
-
-def longs(*values: int) -> Value:
-    """Numbers of 32 bits."""
-    return LONG, struct.pack(f"<{len(values)}I", *values)
-
-
-def text(value: str | None, encoding: str = "ascii") -> Value | None:
-    """A text; ASCII by the standard, what does not fit becomes a question mark."""
-    return (ASCII, value.encode(encoding, "replace") + b"\0") if value else None
-
-
-def rationals(*values: float | None) -> Value | None:
-    """Positive numbers as quotients, at most a millionth off; nothing unless all of them are known."""
-    packed = b""
-    for value in values:
-        if value is None:
-            return None
-        finite = min(value, _MAX_UINT32)  # by which EXIF writes infinity
-        part = Fraction(finite).limit_denominator(min(1_000_000, int(_MAX_UINT32 / max(finite, 1.0))))
-        packed += struct.pack("<2I", part.numerator, part.denominator)
-    return RATIONAL, packed
-
-
-def signed_rationals(*values: float) -> Value:
-    """Numbers as signed quotients."""
-    parts = [Fraction(float(value)).limit_denominator(1_000_000) for value in values]
-    return SRATIONAL, b"".join(struct.pack("<2i", part.numerator, part.denominator) for part in parts)
 
 
 def laid_out(tags: Written) -> bytes:
@@ -213,16 +179,20 @@ def laid_out(tags: Written) -> bytes:
 
 def _packed(directory: Written, offset: int) -> bytes:
     """Lay a directory out to stand at `offset` of the file; long values and those below it right behind."""
-    entries = sorted((tag, value) for tag, value in directory.items() if value)
+    entries = [
+        (tag, value)
+        for tag, value in sorted(directory.items())
+        if (value if isinstance(value, Mapping) else value[1] not in (None, "", b""))
+    ]
     position = offset + 2 + ENTRY * len(entries) + 4
     head, tail = struct.pack("<H", len(entries)), b""
     for tag, value in entries:
         tail += bytes(len(tail) % 2)  # values begin on a word boundary
         place = position + len(tail)
         if isinstance(value, Mapping):
-            (kind, data), behind = longs(place), _packed(value, place)
+            kind, data, behind = LONG, struct.pack("<I", place), _packed(value, place)
         else:
-            kind, data = value
+            kind, data = value[0], _bytes_of(*value)
             behind = data if len(data) > 4 else b""
         head += struct.pack("<HHI", tag, kind, len(data) // _SIZES[kind])
         head += struct.pack("<I", place) if behind else data.ljust(4, b"\0")
@@ -230,24 +200,41 @@ def _packed(directory: Written, offset: int) -> bytes:
     return head + bytes(4) + tail
 
 
+def _bytes_of(kind: int, value: bytes | str | float | Sequence[float] | None) -> bytes:
+    """Bytes of a value: quotients a millionth off at most, text in ASCII with question marks for the rest."""
+    if isinstance(value, bytes):
+        return value
+    if isinstance(value, str):
+        return value.encode("ascii", "replace") + b"\0"
+    numbers = [value] if isinstance(value, int | float) else [*(value or ())]
+    if kind in {RATIONAL, SRATIONAL}:
+        most, quotients = (2**32 if kind == RATIONAL else 2**31) - 1, list[float]()
+        for number in numbers:
+            finite = min(number, most)  # by which EXIF writes infinity
+            part = Fraction(finite).limit_denominator(min(1_000_000, int(most / max(abs(finite), 1.0))))
+            quotients += part.numerator, part.denominator
+        numbers = quotients
+    return struct.pack(f"<{len(numbers)}{_FORMATS[kind][0]}", *numbers)
+
+
 def write_strip(file: BinaryIO, tags: Written, pixels: NDArray[np.generic]) -> None:
     """Write a TIFF structure and the pixels `(row, col[, channel])`, as one strip that is not compressed."""
     height, width = pixels.shape[:2]
     samples = pixels.shape[2] if pixels.ndim == 3 else 1
-    whole = {
+    whole: dict[int, Value | Written] = {
         **tags,
-        256: longs(width),
-        257: longs(height),
-        258: shorts(*(8 * pixels.dtype.itemsize,) * samples),
-        259: shorts(1),  # not compressed
-        273: longs(0),
-        277: shorts(samples),
-        278: longs(height),
-        279: longs(pixels.nbytes),
-        284: shorts(1),  # interleaved
+        256: (LONG, width),
+        257: (LONG, height),
+        258: (SHORT, [8 * pixels.dtype.itemsize] * samples),
+        259: (SHORT, 1),  # not compressed
+        273: (LONG, 0),
+        277: (SHORT, samples),
+        278: (LONG, height),
+        279: (LONG, pixels.nbytes),
+        284: (SHORT, 1),  # interleaved
     }
     at = len(laid_out(whole))
     at += -at % 16
-    whole[273] = longs(at)
+    whole[273] = LONG, at
     file.write(laid_out(whole).ljust(at, b"\0"))
     file.write(np.ascontiguousarray(pixels).astype(pixels.dtype.newbyteorder("<"), copy=False).data)

@@ -37,16 +37,16 @@ from lensmodel.photo.colour import (
 )
 from lensmodel.photo.metadata import written_tags, xmp_packet
 from lensmodel.photo.tiff import (
+    ASCII,
     BYTE,
     GPS,
+    LONG,
+    RATIONAL,
+    SHORT,
+    SRATIONAL,
     UNDEFINED,
     Written,
     laid_out,
-    longs,
-    rationals,
-    shorts,
-    signed_rationals,
-    text,
     write_strip,
 )
 from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, PhotoMetadata, remarks_log
@@ -119,8 +119,8 @@ def write_image(
             _write_png(file, upright(pixels, encoding.metadata.orientation), chunks)
         else:
             sample_format = 1 if format == "tiff16" else 3  # whole numbers, or floating-point
-            of_rgb = {262: shorts(2), 339: shorts(*(sample_format,) * 3)}
-            blocks = {_XMP_TAG: (BYTE, xmp), _ICC_TAG: (UNDEFINED, target.icc)}
+            of_rgb: Written = {262: (SHORT, 2), 339: (SHORT, [sample_format] * 3)}
+            blocks: Written = {_XMP_TAG: (BYTE, xmp), _ICC_TAG: (UNDEFINED, target.icc)}
             write_strip(file, {**tags, **of_rgb, **blocks}, pixels)
 
 
@@ -212,14 +212,14 @@ def _linear_dng_tags(encoding: Encoding) -> Written:
         # To XYZ under D50, and back from D65, which is what the DNG tag means.
         to_camera = np.linalg.inv(np.linalg.inv(D65_TO_D50) @ _to_xyz_d50(encoding))
     neutral = tuple(1.0 / balance for balance in encoding.white_balance)
-    lists = {OPCODES_2: encoding.opcodes_2, OPCODES_3: encoding.opcodes_3}
     return {
         **dng_tags(encoding.metadata.without_serials(), to_camera, neutral, encoding.baseline_exposure),
-        262: shorts(34892),  # PhotometricInterpretation: linear RAW
+        262: (SHORT, 34892),  # PhotometricInterpretation: linear RAW
         # LibRaw 0.22 takes a black level of linear images off the values but not off the white level
-        50714: shorts(0, 0, 0),
-        50717: shorts(65535, 65535, 65535),
-        **{tag: (UNDEFINED, block) if block else None for tag, block in lists.items()},
+        50714: (SHORT, (0, 0, 0)),
+        50717: (SHORT, (65535, 65535, 65535)),
+        OPCODES_2: (UNDEFINED, encoding.opcodes_2),
+        OPCODES_3: (UNDEFINED, encoding.opcodes_3),
     }
 
 
@@ -275,13 +275,13 @@ def write_bayer_dng(
     tags = {
         **written_tags(metadata),
         **dng_tags(metadata, color_matrix, as_shot_neutral, baseline_exposure),
-        262: shorts(32803),  # PhotometricInterpretation: a colour filter array (TIFF/EP)
-        33421: shorts(2, 2),  # CFARepeatPatternDim
+        262: (SHORT, 32803),  # PhotometricInterpretation: a colour filter array (TIFF/EP)
+        33421: (SHORT, (2, 2)),  # CFARepeatPatternDim
         33422: (BYTE, bytes("RGB".index(letter) for letter in pattern)),  # CFAPattern
         50710: (BYTE, b"\x00\x01\x02"),  # CFAPlaneColor: red, green, blue
-        50711: shorts(1),  # CFALayout: rectangular
-        50714: shorts(black),
-        50717: shorts(white),
+        50711: (SHORT, 1),  # CFALayout: rectangular
+        50714: (SHORT, black),
+        50717: (SHORT, white),
     }
     with atomic(Path(path)) as file:
         write_strip(file, tags, mosaic)
@@ -297,14 +297,14 @@ def dng_tags(
     # programs look cameras up by this name
     unique = full_name(metadata.camera_maker, metadata.camera_model) or "Unknown"
     return {
-        254: longs(0),  # NewSubfileType: the full image
+        254: (LONG, 0),  # NewSubfileType: the full image
         50706: (BYTE, bytes((1, 4, 0, 0))),  # DNGVersion
         50707: (BYTE, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
-        50708: text(unique),  # UniqueCameraModel
-        50713: shorts(1, 1),  # BlackLevelRepeatDim
-        50721: signed_rationals(*np.ravel(color_matrix)),  # ColorMatrix1
-        50728: rationals(*as_shot_neutral),
-        50730: None if baseline_exposure is None else signed_rationals(baseline_exposure),
-        50735: text(metadata.body_serial),  # CameraSerialNumber
-        50778: shorts(21),  # CalibrationIlluminant1: D65, in the numbers of Exif's LightSource
+        50708: (ASCII, unique),  # UniqueCameraModel
+        50713: (SHORT, (1, 1)),  # BlackLevelRepeatDim
+        50721: (SRATIONAL, np.ravel(color_matrix).tolist()),  # ColorMatrix1
+        50728: (RATIONAL, np.ravel(as_shot_neutral).tolist()),
+        50730: (SRATIONAL, baseline_exposure),
+        50735: (ASCII, metadata.body_serial),  # CameraSerialNumber
+        50778: (SHORT, 21),  # CalibrationIlluminant1: D65, in the numbers of Exif's LightSource
     }

@@ -31,7 +31,7 @@ from lensmodel.core.errors import (
 )
 from lensmodel.photo.colour import matrix_profile, named_profile
 from lensmodel.photo.mosaic import require_known_mosaic
-from lensmodel.photo.tiff import BYTE, Tag, Tags, Value, laid_out, longs, shorts
+from lensmodel.photo.tiff import BYTE, LONG, SHORT, Tag, Tags, laid_out
 from lensmodel.photo.writing import write_bayer_dng
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
@@ -136,7 +136,7 @@ def test_every_mosaic_that_is_not_demosaiced_here_is_refused(
     rows: int, columns: int, colours: str, tmp_path: Path
 ) -> None:
     pattern = bytes("RGBCMYW".index(letter) for letter in colours)
-    tags = {256: longs(64), 257: longs(48), 33421: shorts(rows, columns), 33422: (BYTE, pattern)}
+    tags = {256: (LONG, 64), 257: (LONG, 48), 33421: (SHORT, (rows, columns)), 33422: (BYTE, pattern)}
     (tmp_path / "x.dng").write_bytes(laid_out({**tags, 50706: (BYTE, b"\1\4\0\0")}))
 
     with pytest.raises(UnsupportedFormatError, match=f"{rows} x {columns} pixels"):
@@ -544,10 +544,10 @@ def test_one_number_of_a_huge_tag_unpacks_no_other() -> None:
     assert peak < 2 * entry.count * 8  # a copy of the bytes; as numbers they take seven times as much
 
 
-@pytest.mark.parametrize("version", [None, (BYTE, b"\1\4\0\0")], ids=["tiff", "dng"])
-def test_a_size_that_is_no_whole_number_is_no_size(tmp_path: Path, version: Value | None) -> None:
+@pytest.mark.parametrize("version", [b"", b"\1\4\0\0"], ids=["tiff", "dng"])
+def test_a_size_that_is_no_whole_number_is_no_size(tmp_path: Path, version: bytes) -> None:
     double = (12, struct.pack("<d", 1e300))
-    (tmp_path / "x").write_bytes(laid_out({256: double, 257: double, 50706: version}))
+    (tmp_path / "x").write_bytes(laid_out({256: double, 257: double, 50706: (BYTE, version)}))
 
     with pytest.raises(LensModelError):
         photo.inspect(tmp_path / "x")

@@ -15,7 +15,7 @@ from lensmodel import calibrate, correct, photo, simulate
 from lensmodel.core.errors import RawDecodeError, UnsupportedFormatError
 from lensmodel.core.types import LensSettings, Zone
 from lensmodel.photo.mosaic import replace_defects
-from lensmodel.photo.tiff import BYTE, shorts, write_strip
+from lensmodel.photo.tiff import BYTE, SHORT, write_strip
 from lensmodel.photo.writing import dng_tags, write_bayer_dng
 
 CAMERA = simulate.SimulatedCamera(height=400, width=600)
@@ -60,11 +60,11 @@ def write(path: Path, values: NDArray[np.uint16]) -> Path:
 def write_xtrans(path: Path, values: NDArray[np.uint16]) -> Path:
     tags = {
         **dng_tags(photo.PhotoMetadata(camera_model="X-1"), np.eye(3), (0.5, 1.0, 0.5), None),
-        262: shorts(32803),
-        33421: shorts(6, 6),
+        262: (SHORT, 32803),
+        33421: (SHORT, (6, 6)),
         33422: (BYTE, bytes("RGB".index(letter) for letter in "".join(XTRANS))),
-        50714: shorts(CAMERA.black),
-        50717: shorts(CAMERA.white),
+        50714: (SHORT, CAMERA.black),
+        50717: (SHORT, CAMERA.white),
     }
     with path.open("wb") as file:
         write_strip(file, tags, values)

@@ -14,7 +14,7 @@ from scipy import ndimage
 from lensmodel import photo
 from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
-from lensmodel.photo.tiff import shorts, write_strip
+from lensmodel.photo.tiff import SHORT, write_strip
 from lensmodel.photo.writing import dng_tags, write_bayer_dng
 
 BLACK, WHITE = 512, 15000
@@ -148,7 +148,7 @@ def test_white_of_a_linear_dng_with_black_levels_is_one(
     low, high = np.array(black), np.resize(white, 3)
     codes = np.rint(low + np.moveaxis(planes, 0, -1) * (high - low)).astype(np.uint16)
     tags = dng_tags(photo.PhotoMetadata(), np.eye(3), (1.0, 1.0, 1.0), None)
-    levels = {262: shorts(34892), 50714: shorts(*black), 50717: shorts(*white)}
+    levels = {262: (SHORT, 34892), 50714: (SHORT, black), 50717: (SHORT, white)}
     with (tmp_path / "x.dng").open("wb") as file:
         write_strip(file, {**tags, **levels}, codes)
     developed = photo.develop(tmp_path / "x.dng")

@@ -314,8 +314,8 @@ def cleaned(data: bytes) -> bytes:
 def tiff_with_gps() -> bytes:
     """Write a grey TIFF with our own hand: image libraries leave GPS directories out of TIFF files."""
     out = io.BytesIO()
-    places = {1: tiff.text("N"), 2: tiff.rationals(*LATITUDE)}
-    tags = {262: tiff.shorts(1), 271: tiff.text("Maker"), tiff.EXIF: {0x829D: tiff.rationals(1.4)}}
+    places = {1: (tiff.ASCII, "N"), 2: (tiff.RATIONAL, LATITUDE)}
+    tags = {262: (tiff.SHORT, 1), 271: (tiff.ASCII, "Maker"), tiff.EXIF: {0x829D: (tiff.RATIONAL, 1.4)}}
     tiff.write_strip(out, {**tags, tiff.GPS: places}, PIXELS[:, :, 0])
     return out.getvalue()
 
@@ -375,7 +375,7 @@ def test_the_checksums_of_a_png_are_right_afterwards_and_packed_metadata_are_hid
     assert read.info["Title"] == "stays"
 
 
-BOX = b"CMT4" + tiff.laid_out({1: tiff.text("N"), 2: tiff.rationals(*LATITUDE)})
+BOX = b"CMT4" + tiff.laid_out({1: (tiff.ASCII, "N"), 2: (tiff.RATIONAL, LATITUDE)})
 
 
 @pytest.mark.parametrize(

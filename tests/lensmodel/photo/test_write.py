@@ -334,19 +334,17 @@ def test_the_xmp_packet_says_what_was_done_and_which_lens_it_was(
     assert described.get(f"{aux}Lens") == "My 24 mm & adapter"
     event = next(one for one in packet.iter(f"{rdf}li") if one.get(f"{events}action"))
     assert event.get(f"{events}parameters") == done
-    assert done in [one.text for one in packet.iter(f"{rdf}li")]
 
 
 def test_a_packet_of_names_that_xml_cannot_write_is_still_xml() -> None:
-    strange = replace(PLAIN.metadata, artist="X\x01T\x1f-3 <&\ufffe>")
+    strange = replace(PLAIN.metadata, keywords=("X\x01T\x1f-3 <&\ufffe>",))
 
     packet = ET.fromstring(xmp_packet(strange, "done\x0b", "x\x02"))
 
     described = next(packet.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"))
     assert described.get("{http://ns.adobe.com/exif/1.0/aux/}Lens") == "x "
     assert [item.text for item in packet.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}li")][1:] == [
-        "X T -3 <& >",
-        "done ",
+        "X T -3 <& >"
     ]
 
 

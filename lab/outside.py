@@ -50,7 +50,7 @@ def judged(path: Path, settings: LensSettings) -> Iterator[Judged]:
             continue
         answer = model.query(star.position, green, SIZE)
         found, point = (distance(kernel, star.kernel).rel_l2 for kernel in (answer.kernel, delta(SIZE)))
-        errors = (found, answer.predicted_error, star.error, point)
+        errors = (found, answer.predicted_error, star.error or 0.0, point)
         yield Judged(star.position.r, *errors, width, rms_width(answer.kernel))
 
 

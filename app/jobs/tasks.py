@@ -235,26 +235,21 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
 def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
     """Measure the PSF on photos made for it, in `developed`; samples go to the folder."""
     photos = [sampling.load_developed(Path(name)) for name in arguments["developed"]]
-    method = lens_measure.methods.create(arguments["kind"])
-    measurements = method.measure(photos, size=arguments["size"], on_step=progress)
-    samples = lens_measure.samples_of(
-        [replace(measured, error=min(measured.error, 1.0)) for measured in measurements],
-        method,
-        photos[0],
-        photo_id=arguments["photo"],
+    samples = lens_measure.methods.create(arguments["kind"]).measure(
+        photos,
+        size=(side := arguments["size"]),
         settings=_settings(arguments["settings"]),
+        photo_id=arguments["photo"],
+        on_step=progress,
     )
     write_samples(folder, samples)
-    numbers: dict[tuple[float, float], int] = {}
-    return [
-        {
-            "idx": numbers.setdefault(measured.pixel, len(numbers)),
-            "row": round(measured.pixel[0] - (measured.side - 1) / 2),
-            "col": round(measured.pixel[1] - (measured.side - 1) / 2),
-            "side": measured.side,
-        }
-        for measured in measurements
-    ]
+    numbers: dict[FieldPosition, int] = {}
+    places = []
+    for sample in samples:
+        row, col = (round(middle - (side - 1) / 2) for middle in photos[0].frame.pixel(sample.position))
+        number = numbers.setdefault(sample.position, len(numbers))
+        places.append({"idx": number, "row": row, "col": col, "side": side})
+    return places
 
 
 def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:

@@ -78,6 +78,5 @@ def measured_field(case: Case, path: Path) -> PsfField:
     rng = np.random.default_rng([case.seed, _SEED])
     write_photo(path, photograph(scene, case.lens, case.settings, case.camera, rng, exposure=_EXPOSURE))
     photo, method = develop(path), Target(details=(page.detail,))
-    found = method.measure([photo], size=SIZE)
-    samples = measured.samples_of(found, method, photo, photo_id="target", settings=case.settings)
+    samples = method.measure([photo], size=SIZE, settings=case.settings, photo_id="target")
     return LensModel.fit(samples).field(case.settings, pitch_um=case.camera.pitch_um)

@@ -11,7 +11,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.measured.edges import SlantedEdges
-from lensmodel.measured.measurer import MeasuredPsf, Measurer, samples_of
+from lensmodel.measured.measurer import Measurer
 from lensmodel.measured.pair import AperturePair
 from lensmodel.measured.points import Points
 from lensmodel.measured.target import DETAILS, PAPERS, Target, TargetPage, print_target
@@ -24,13 +24,11 @@ methods: Final[Registry[Measurer]] = Registry(
 __all__ = [
     "DETAILS",
     "PAPERS",
-    "MeasuredPsf",
     "Measurer",
     "TargetPage",
     "measurements_of",
     "methods",
     "print_target",
-    "samples_of",
     "samples_of_developed",
 ]
 
@@ -51,8 +49,8 @@ def samples_of_developed(
     metadata = photos[0].info.metadata
     photos[0].info.require_known_turn()
     metadata.require_aperture(settings)
-    measured = method.measure(photos, size=size, on_step=on_step)
-    return samples_of(measured, method, photos[0], photo_id=photo_id, settings=metadata.settings(settings))
+    said = metadata.settings(settings)
+    return method.measure(photos, size=size, settings=said, photo_id=photo_id, on_step=on_step)
 
 
 def measurements_of(kind: str, paths: Sequence[Path]) -> list[tuple[Path, ...]]:

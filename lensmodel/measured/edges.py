@@ -265,11 +265,7 @@ def _square_psf(photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge
         lambda vector: np.concatenate([misfit(vector), (vector - start) / _SPREAD]),
         start, bounds=(low, np.inf), x_scale=_SPREAD, max_nfev=_STEPS, ftol=1e-7,
     )  # fmt: skip
-    middle, side = (
-        np.mean([edge.middle for edge in square], axis=0),
-        max(max(edge.box[2:]) for edge in square),
-    )
-    return Found(_kernel(result.x, size), 0.0, middle, side)
+    return Found(_kernel(result.x, size), 0.0, np.mean([edge.middle for edge in square], axis=0))
 
 
 def _starts(lines: Sequence[_Line]) -> list[NDArray[np.float64]]:

@@ -50,32 +50,8 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
 from lensmodel.core.numerics import fista, nonnegative_least_squares, on_simplex
 from lensmodel.core.psf import MEASURED, PsfSample, as_kernel, centred, centroid
-from lensmodel.core.types import (
-    CHANNELS,
-    Channel,
-    FieldPosition,
-    Kernel,
-    LensSettings,
-    NoiseModel,
-    StepHook,
-    ignore_step,
-)
+from lensmodel.core.types import CHANNELS, Channel, Kernel, LensSettings, NoiseModel, StepHook, ignore_step
 from lensmodel.photo import LinearPhoto
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredPsf:
-    """A PSF measured at one place of a photo."""
-
-    kernel: Kernel  # (k, k), impulse response on the sensor's grid, centre of mass on the middle pixel
-    position: FieldPosition  # middle of what it was measured on
-    channel: Channel  # colour plane
-    error: float  # relative L2 distance to the truth that the method expects
-    pixel: tuple[float, float]  # middle of what it was measured on, (row, col)
-    side: int  # side in pixels of the window that it was measured on
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "kernel", as_kernel(self.kernel))
 
 
 class Found(NamedTuple):
@@ -84,7 +60,6 @@ class Found(NamedTuple):
     kernel: Kernel
     error: float  # expected relative L2, as far as the window shows it
     middle: Sequence[float] | NDArray[np.floating]  # pixel (row, col)
-    side: int  # in pixels
 
 
 Prepared: TypeAlias = tuple[Sequence[Any], Callable[[Any, Channel], Found]]
@@ -110,11 +85,14 @@ class Measurer(ABC):
         *,
         size: int,
         channels: Sequence[Channel] = CHANNELS,
+        settings: LensSettings | None = None,
+        photo_id: str = "",
         on_step: StepHook = ignore_step,
-    ) -> list[MeasuredPsf]:
-        """Measure the PSF wherever the photos, as many as `photos` says, show it.
+    ) -> list[PsfSample]:
+        """Measure the PSF wherever the photos, as many as `photos` says, show it: samples for a `LensModel`.
 
-        The first is the one whose PSF is measured; kernels have an odd side of `size` pixels. `on_step` is
+        The first is the one whose PSF is measured, at `settings`, else those that it says itself; kernels
+        have an odd side of `size` pixels. The estimator is called `measured-NAME/VERSION`. `on_step` is
         called after each place, and now and then before the first one, with nothing done of 1.
         """
         if len(photos) != self.photos:
@@ -124,52 +102,34 @@ class Measurer(ABC):
             )
         if size < 3 or size % 2 == 0:
             raise InvalidInputError(f"kernels have an odd side of 3 pixels or more, got {size}")
+        first, samples = photos[0], list[PsfSample]()
+        settings = settings or first.info.metadata.settings()
         places, psf_in = self._prepare(photos, size, on_step)
-        psfs = []
         for done, place in enumerate(places, start=1):
             for channel in channels:
                 with contextlib.suppress(LensModelError):
-                    kernel, own, (row, col), side = psf_in(place, channel)
-                    error, position = math.hypot(own, self.floor), photos[0].frame.position(row, col)
-                    if error < self.most:  # an error that is not known is none
-                        pixel = float(row), float(col)
-                        psfs.append(MeasuredPsf(kernel, position, channel, error, pixel, side))
+                    kernel, own, (row, col) = psf_in(place, channel)
+                    if not (error := math.hypot(own, self.floor)) < self.most:  # not known, or too large
+                        continue
+                    sample = PsfSample(
+                        kernel,
+                        first.frame.position(row, col),
+                        settings.with_channel(channel),
+                        photo=photo_id,
+                        pixel_pitch_um=first.info.metadata.pixel_pitch_um,
+                        estimator=f"{MEASURED}{self.name}/{self.version}",
+                        error=error,
+                        half_diagonal_px=first.frame.half_diagonal,
+                    )
+                    samples.append(sample)
             on_step(done, len(places))
-        if not psfs:
+        if not samples:
             raise NotEnoughEvidenceError(self.nothing)
-        return psfs
+        return samples
 
     @abstractmethod
     def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
         """Find the places that photos show, and what measures one of them in a colour or raises."""
-
-
-def samples_of(
-    measured: Sequence[MeasuredPsf],
-    method: Measurer,
-    photo: LinearPhoto,
-    *,
-    photo_id: str,
-    settings: LensSettings,
-) -> list[PsfSample]:
-    """Make samples of measurements, as a `LensModel` takes them.
-
-    The estimator is called `measured-NAME/VERSION`; the weight is 1, the error is the measurement's own.
-    """
-    return [
-        PsfSample(
-            kernel=psf.kernel,
-            position=psf.position,
-            settings=settings.with_channel(psf.channel),
-            weight=1.0,
-            photo=photo_id,
-            pixel_pitch_um=photo.info.metadata.pixel_pitch_um,
-            estimator=f"{MEASURED}{method.name}/{method.version}",
-            error=psf.error,
-            half_diagonal_px=photo.frame.half_diagonal,
-        )
-        for psf in measured
-    ]
 
 
 # --- the kernel of a window ------------------------------------------------------------------------

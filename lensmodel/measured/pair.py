@@ -77,7 +77,7 @@ class AperturePair(Measurer):
             window = Window.of(opened, channel, corner, self.side)
             scene, noise = _scene(closed, warp, window, channel, size)
             kernel, error, _ = window_psf(window, scene, size, latent_noise=noise)
-            return Found(kernel, error, window.middle, self.side)
+            return Found(kernel, error, window.middle)
 
         return corners, psf_in
 

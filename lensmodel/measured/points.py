@@ -148,7 +148,7 @@ def _cell_psf(
             break
         lights, solved, left = moved, again, rest
     middle = np.average(pixels[seen], axis=0, weights=lights.fluxes)
-    return Found(centred(solved.kernel), math.hypot(solved.error, left), middle, size)
+    return Found(centred(solved.kernel), math.hypot(solved.error, left), middle)
 
 
 def _stacked(lights: _Lights, kernel: NDArray[np.float64] | None) -> Solved:

@@ -243,7 +243,7 @@ class Target(Measurer):
         def psf_in(corner: tuple[int, int], channel: Channel) -> Found:
             window = Window.of(photo, channel, corner, self.side)
             kernel, error, *_ = _solved(window, placed, size)
-            return Found(kernel, error, window.middle, self.side)
+            return Found(kernel, error, window.middle)
 
         return corners, psf_in
 

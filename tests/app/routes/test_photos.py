@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,10 +27,11 @@ from app.store import Store
 from app.store.owners import ANY_OWNER
 from lab.kernels import gaussian
 from lensmodel.blind import sampling
+from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import FieldPosition, Frame, NoiseModel, ignore_step
-from lensmodel.measured import MeasuredPsf
+from lensmodel.core.types import Channel, FieldPosition, Frame, NoiseModel, StepHook, ignore_step
+from lensmodel.measured.measurer import Found, Measurer, Prepared
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo
 
@@ -234,20 +235,18 @@ PNG = b"\x89PNG\r\n\x1a\n" + b"\0" * 4096
 PLACE = {"idx": 0, "row": 10, "col": 20, "side": 144, "r": 0.3, "phi": 0.1, "error": 0.04}
 
 
-class AtTwoPlaces:
-    """Measures the middle well in two colours, and a corner so badly that it cannot say how badly."""
+class AtTwoPlaces(Measurer):
+    """Measures the middle in green and red, and a corner in green."""
 
-    name: ClassVar[str] = "quick"
-    version: ClassVar[int] = 3
-    photos: ClassVar[int] = 1
+    name, version, floor, nothing = "quick", 3, 0.0, ""
 
-    def measure(self, photos: Sequence[LinearPhoto], *, size: int, **_: Any) -> list[MeasuredPsf]:
-        kernel, middle, corner = gaussian(size, np.eye(2)), FieldPosition(0.1, 0.2), FieldPosition(0.9, -2.0)
-        return [
-            MeasuredPsf(kernel, middle, "g", 0.04, (30.0, 40.0), 21),
-            MeasuredPsf(kernel, corner, "g", math.inf, (50.5, 4.5), 8),
-            MeasuredPsf(kernel, middle, "r", 0.05, (30.0, 40.0), 21),
-        ]
+    def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
+        def psf_in(place: tuple[float, float], channel: Channel) -> Found:
+            if channel == "b" or (channel == "r" and place[0] > 40.0):
+                raise NotEnoughEvidenceError("seen in no other colour")
+            return Found(gaussian(size, np.eye(2)), 0.04 if channel == "g" else 0.05, place)
+
+        return [(30.0, 40.0), (50.0, 12.0)], psf_in
 
 
 def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,13 +261,13 @@ def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.Monk
     patches, samples = _measured(json.loads(json.dumps(listed)), tmp_path)
 
     assert [[p[name] for name in ("cell", "row", "col", "size", "score")] for p in patches] == [
-        [0, 20, 30, 21, 0.96],
-        [1, 47, 1, 8, 0],
+        [0, 23, 33, 15, 0.95],
+        [1, 43, 5, 15, 0.96],
     ]
     assert [(number, sample.settings.channel, sample.error) for number, sample in samples] == [
-        (0, "g", 0.04),
-        (1, "g", 1.0),
         (0, "r", 0.05),
+        (0, "g", 0.04),
+        (1, "g", 0.04),
     ]
     assert {(sample.estimator, sample.weight) for _, sample in samples} == {("measured-quick/3", 1.0)}
 

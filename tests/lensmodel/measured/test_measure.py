@@ -222,17 +222,20 @@ def test_a_match_says_how_far_the_photo_lies_beyond() -> None:
     assert seen == pytest.approx((3, -5), abs=0.1)
 
 
+class Sure(Measurer):
+    """Measures one kernel in the same place, with these errors."""
+
+    name, floor, most, nothing = "sure", 0.0, 0.5, "nowhere"
+
+    def __init__(self, *errors: float) -> None:
+        self.errors = errors
+
+    def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
+        kernel = gaussian(size, np.eye(2))
+        return self.errors, lambda error, _: Found(kernel, error, (30.0, 30.0))
+
+
 def test_a_psf_whose_error_is_not_known_is_left_out_and_the_others_stay() -> None:
-    class Sure(Measurer):
-        name, floor, most, nothing = "sure", 0.0, 0.5, "nowhere"
-
-        def __init__(self, *errors: float) -> None:
-            self.errors = errors
-
-        def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
-            kernel = gaussian(size, np.eye(2))
-            return self.errors, lambda error, _: Found(kernel, error, (30.0, 30.0), 9)
-
     photo = photo_of(np.full((128, 128), 0.3), gaussian(5, np.eye(2)))
     found = Sure(math.nan, 0.1, 0.6).measure([photo], size=9, channels=("g",))
 
@@ -414,15 +417,13 @@ def test_squares_give_red_its_own_kernel_where_demosaicing_gave_it_the_sharpness
 
 
 def test_measured_samples_join_or_replace_blind_ones() -> None:
-    photo, method = grey_photo(), measure.methods.create("target")
-    place = measure.MeasuredPsf(gaussian(11, np.eye(2)), photo.frame.position(9, 9), "g", 0.04, (9.0, 9.0), 9)
-    old, other, new = (
-        measure.samples_of([place], method, photo, photo_id=name, settings=LensSettings(aperture=n))
+    (old,), (other,), new = (
+        Sure(0.04).measure([grey_photo()], size=11, channels=("g",), settings=LensSettings(n), photo_id=name)
         for n, name in ((2.0, "old"), (5.6, "other"), (2.0, "new"))
     )
-    assert new[0].estimator == "measured-target/1"
+    assert new[0].estimator == "measured-sure/1"
     assert new[0].measured
-    model = LensModel.fit([replace(sample, estimator="blind/1") for sample in (*old, *other)])
+    model = LensModel.fit([replace(sample, estimator="blind/1") for sample in (old, other)])
     assert [s.photo for s in joined(model, new).samples] == ["old", "other", "new"]
     assert [s.photo for s in joined(model, new, replace=True).samples] == ["other", "new"]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias, cast
 
 import imagecodecs
 import numpy as np
@@ -187,10 +187,7 @@ def linear_profile(to_xyz_d50: Matrix, name: str) -> bytes:
 
 def matrix3(matrix: Matrix | None) -> Matrix3 | None:
     """Return a matrix as nested tuples, which are hashable and travel as JSON."""
-    if matrix is None:
-        return None
-    a, b, c = (tuple(float(v) for v in row) for row in matrix[:3, :3])
-    return (a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2])
+    return None if matrix is None else cast("Matrix3", tuple(map(tuple, matrix[:3, :3].tolist())))
 
 
 def camera_to_srgb(xyz_to_camera: Matrix) -> Matrix | None:

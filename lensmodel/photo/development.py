@@ -544,12 +544,6 @@ def _three_channels(pixels: Pixels) -> Pixels:
         pixels = pixels.astype(np.float32)
         known = pixels[np.isfinite(pixels)]
         pixels = np.nan_to_num(pixels, posinf=max(1.0, float(known.max(initial=0.0))), neginf=0.0)
-    elif pixels.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
-        raise UnsupportedFormatError(
-            f"samples of type {pixels.dtype} are not read; save it with 8 or 16 bits"
-        )
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
-    if pixels.ndim != 3 or pixels.shape[2] > 4:
-        raise UnsupportedFormatError(f"a picture of shape {pixels.shape} is no photo; give RGB on one page")
     return np.repeat(pixels[:, :, :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[:, :, :3]

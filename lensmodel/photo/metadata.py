@@ -268,8 +268,6 @@ def _maker_note(maker: str, note: Tag, reader: TiffReader) -> PhotoMetadata:
     """Read the maker note of EXIF tag 0x927C by its first bytes, or the maker's name."""
     buffer, start = reader.buffer, note.offset
     head, at = bytes(buffer[start : start + 16]), start - reader.base
-    if head.startswith(b"OLYMP\0"):  # its offsets count from the file's TIFF header
-        return _olympus(reader, at + 8)
     if head.startswith((b"OLYMPUS\0", b"OM SYSTEM\0\0\0")):
         first = 12 if head[:8] == b"OLYMPUS\0" else 16
         order = {b"II": "<", b"MM": ">"}.get(head[first - 4 : first - 2])
@@ -307,12 +305,8 @@ def _canon(note: Tag, reader: TiffReader) -> PhotoMetadata:
 
 
 def _olympus(reader: TiffReader, first: int) -> PhotoMetadata:
-    tags, parts = reader.directory(first)[0], list[Tags]()
-    for pointer in (0x2010, 0x2050):  # equipment and focus, given by a pointer or, in older notes, in place
-        in_place = pointer in tags and tags[pointer].count != 1
-        place = tags[pointer].offset - reader.base if in_place else tags.integer(pointer)
-        parts.append(reader.directory(place)[0])
-    equipment, focus = parts
+    tags, _ = reader.directory(first)
+    equipment, focus = reader.below(tags, 0x2010), reader.below(tags, 0x2050)
     # Millimetres over 1 in some models, centimetres over 10 in others: the numerator is in mm.
     millimetres = int.from_bytes(focus.raw(0x0305)[:4], "little" if reader.order == "<" else "big")
     return PhotoMetadata(

@@ -131,16 +131,8 @@ _GAIN = _answer(
     "ZoneGain",
     **dict.fromkeys(("cells", "left"), (Count, 0)),
     **dict.fromkeys(("expected_gain_db", "psf_error"), (float | None, None)),
-    held_back=(Share, 0.0),
-    reasons=(_several(20, Text), []),
 )
-_ZONE_AUDIT = _answer(
-    "ZoneAudit", tiles=Count, tiles_held=Count, held_back=Share, checks=_several(20, Text, Share)
-)
-_HELD = _answer("Held", row=Pixel, col=Pixel, held_back=Share)
-_AUDIT = _answer(
-    "Audit", zones=_several(3, Zone, _ZONE_AUDIT), tiles=(_several(100_000, _HELD), []), tile_side=(Count, 0)
-)
+_AUDIT = _answer("Audit", held_back=Share, checks=_several(20, Text, Share))
 _REPORT = _answer(
     "Report", zones=_several(3, Zone, _GAIN), nothing_to_correct=(bool, False), audit=(_AUDIT | None, None)
 )

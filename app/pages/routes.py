@@ -33,7 +33,6 @@ from lensmodel.api import SEEN_DB
 from lensmodel.cli.console import gain_words
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import full_name
-from lensmodel.correction.audit import HELD
 from lensmodel.photo.values import ENDINGS
 from lensmodel.report import LensReport, Unit, caution, place_table, sharpness
 
@@ -63,9 +62,7 @@ templates.filters.update(
     # without the figures, in brackets or after a colon, which are for testers
     plain=partial(re.sub, r" \([^)]*\)|: [^:]*\d%[^:]*?(?=\.?$)", ""),
 )
-templates.globals.update(
-    picker_endings=",".join((*sorted(ENDINGS), "image/*")), full_name=full_name, HELD=HELD
-)
+templates.globals.update(picker_endings=",".join((*sorted(ENDINGS), "image/*")), full_name=full_name)
 templates.globals["words"] = templates.get_template("words.html").module  # in all of them
 
 

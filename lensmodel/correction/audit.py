@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
 import numpy as np
 
 from lensmodel.core.numerics import jit
-from lensmodel.core.types import CHANNELS, ZONES, Plane, Planes, Zone
-from lensmodel.correction.blur import Complex, Real, UniformBlur, fast_shape, smooth, through
+from lensmodel.core.types import CHANNELS, Plane, Planes
+from lensmodel.correction.blur import ZERO, Real, UniformBlur, block_sums, interpolated, smooth
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.richardson_lucy import LEAST_CLIPPED
 
@@ -39,17 +39,24 @@ _WEIGHTS: Final = np.array([1, 2, 3, 4, 5, 4, 3, 2, 1], dtype=np.float32)
 _FOOT: Final = np.array([0.16, 0.5, 0.84, 1, 1, 1, 0.84, 0.5, 0.16], dtype=np.float32)
 """Share that is held back beside a faulty pixel, along rows and columns (chosen: no edge shows)."""
 
-HELD: Final = 0.1
-"""Share of a correction from which on a tile counts as held back (chosen: a hundredth is only just seen)."""
-_MAPPED: Final = 0.01  # least share held back at which a tile is on the map (chosen: less is not seen)
 
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """Mean share of a correction that was held back, 0 to 1, and that of each check as if alone."""
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TileAudit:
-    """Mean share of a tile's correction that is held back, 0 to 1, and that of each check as if alone."""
+    held_back: float = 0.0
+    checks: Mapping[str, float] = field(default_factory=dict)
 
-    held_back: float
-    checks: Mapping[str, float]
+    @classmethod
+    def mean(cls, audits: Sequence[Audit]) -> Audit:
+        """The audit of a photo from those of its tiles; a check that held nothing back is left out."""
+        if not audits:
+            return cls()
+        means = {name: float(np.mean([audit.checks.get(name, 0.0) for audit in audits])) for name in LIMITS}
+        return cls(
+            float(np.mean([audit.held_back for audit in audits])),
+            {name: share for name, share in means.items() if share > 0.0},
+        )
 
 
 def held_back(
@@ -59,7 +66,7 @@ def held_back(
     sensors: Sequence[Sensor],
     errors: Sequence[float],
     inner: Window,
-) -> tuple[Planes, TileAudit]:
+) -> tuple[Planes, Audit]:
     """Audit the correction of a tile and mix its `inner` part back towards the photo as far as it fails.
 
     Where all is kept, it is exactly the correction. Without `blurs` nothing is re-blurred; see `kept_shares`.
@@ -67,7 +74,7 @@ def held_back(
     keep, checks = kept_shares(photo, restored, blurs, sensors, errors, inner)
     part = (slice(None), *inner)
     before, after = photo[part], restored[part]
-    audit = TileAudit(float(1.0 - keep.mean(dtype=np.float64)), checks)
+    audit = Audit(float(1.0 - keep.mean(dtype=np.float64)), checks)
     return after if keep.min(initial=1.0) == 1.0 else (after - before) * keep + before, audit
 
 
@@ -98,14 +105,12 @@ def kept_shares(
     y, x = (np.ascontiguousarray(p, dtype=np.float32) for p in (photo, restored))
     shape = (y.shape[1], y.shape[2])
     noise = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
-    powers = np.zeros((6, *_blocks(shape)), dtype=np.float32)
     clip = np.array([min(s.clip, 1e9) for s in sensors], dtype=np.float32)
     keep = np.ones(shape, dtype=np.float32)
     part = (*inner[0].indices(shape[0])[:2], *inner[1].indices(shape[1])[:2])
     spikes = _spikes(y, x, noise, clip, _point_gains(blurs), part, keep)
     checks = {ISOLATED: spikes / keep[inner].size}
-    _powers(y, x, noise, clip, powers)
-    wide = _around(powers)
+    wide = _around(_powers(y, x, noise, clip))
     known = wide[2:5].max(axis=0) + np.float32(_NOISE) * wide[5] + np.float32(1e-12)
     severities = {SPECTRUM: np.sqrt(wide[:2].max(axis=0) / known)}
     if blurs is not None:
@@ -116,7 +121,7 @@ def kept_shares(
             np.float32(2.0) - severity / np.float32(LIMITS[check]), np.float32(0.0), np.float32(1.0)
         )
         if share.min() < 1.0:
-            _lower(keep, share)
+            np.minimum(keep, interpolated(share, _SIDE, *shape), out=keep)
         checks[check] = float(1.0 - share[blocks].mean(dtype=np.float64))
     return keep[inner], checks
 
@@ -135,24 +140,12 @@ def _point_gains(blurs: Sequence[UniformBlur] | None) -> Real:
 
 
 @jit
-def _into_blocks(lines: Real, row: int, sums: Real) -> None:
-    """Add lines `(kind, cols)` to the row of blocks that holds a row of pixels."""
-    for kind in range(lines.shape[0]):
-        for block in range(sums.shape[2]):
-            total = np.float32(0.0)
-            for j in range(8 * block, min(8 * block + 8, lines.shape[1])):
-                total += lines[kind, j]
-            sums[kind, row // 8, block] += total
-
-
-@jit
-def _powers(y: Real, x: Real, noise: Real, clip: Real, powers: Real) -> None:
+def _powers(y: Real, x: Real, noise: Real, clip: Real) -> Real:
     """Sums over blocks of the mean of the colours: D_1, D_2 of x, D_1, D_2, D_4 of y, sigma²."""
     rows, cols = y.shape[1:]
-    zero, third, ninth = np.float32(0.0), np.float32(1.0 / 3.0), np.float32(1.0 / 9.0)
-    share, rim = np.float32(1.0 / 12.0), _COARSE
+    third, share, rim = np.float32(1.0 / 3.0), np.float32(1.0 / 12.0), _COARSE
     luma = np.empty((2, rows, cols + 2 * rim), np.float32)
-    lines = np.zeros((6, cols), np.float32)
+    power = np.empty((rows, cols), np.float32)
     for i in range(rows):
         before, after = luma[0, i, rim : rim + cols], luma[1, i, rim : rim + cols]
         for j in range(cols):
@@ -160,27 +153,27 @@ def _powers(y: Real, x: Real, noise: Real, clip: Real, powers: Real) -> None:
             after[j] = third * (
                 min(x[0, i, j], clip[0]) + min(x[1, i, j], clip[1]) + min(x[2, i, j], clip[2])
             )
-        luma[0, i, :rim], luma[0, i, rim + cols :] = before[0], before[cols - 1]
-        luma[1, i, :rim], luma[1, i, rim + cols :] = after[0], after[cols - 1]
-    for i in range(rows):
-        for j in range(cols):
             total = noise[0, 1] + noise[1, 1] + noise[2, 1]
             for c in range(3):
-                total += noise[c, 0] * max(y[c, i, j], zero)
-            lines[5, j] += ninth * total
-        for kind in range(5):
-            plane = luma[1] if kind < 2 else luma[0]
-            s = _COARSE if kind == 4 else 1 + kind % 2
+                total += noise[c, 0] * max(y[c, i, j], ZERO)
+            power[i, j] = third * third * total
+        luma[0, i, :rim], luma[0, i, rim + cols :] = before[0], before[cols - 1]
+        luma[1, i, :rim], luma[1, i, rim + cols :] = after[0], after[cols - 1]
+    of_noise = block_sums(power, _SIDE)
+    sums = np.empty((6, *of_noise.shape), np.float32)
+    sums[5] = of_noise
+    for kind in range(5):
+        plane = luma[1] if kind < 2 else luma[0]
+        s = _COARSE if kind == 4 else 1 + kind % 2
+        for i in range(rows):
             above, here, below = plane[max(i - s, 0)], plane[i], plane[min(i + s, rows - 1)]
-            line = lines[kind]
             for j in range(cols):
                 two = here[rim + j] + here[rim + j]
                 down = above[rim + j] + below[rim + j] - two
                 across = here[rim + j - s] + here[rim + j + s] - two
-                line[j] += share * (down * down + across * across)
-        if i % 8 == 7 or i == rows - 1:
-            _into_blocks(lines, i, powers)
-            lines[:] = zero
+                power[i, j] = share * (down * down + across * across)
+        sums[kind] = block_sums(power, _SIDE)
+    return sums
 
 
 @jit
@@ -231,64 +224,45 @@ def _misfit(
     y: Planes, x: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor], errors: Sequence[float]
 ) -> Real:
     """Root mean square of the residual around each block, the most of all colours."""
-    shape = (y.shape[1], y.shape[2])
-    grid = fast_shape(tuple(max(extent, blurs[0].kernel.shape[0]) for extent in shape))
-    worst = np.zeros(_blocks(shape), dtype=np.float32)
+    rows, cols = y.shape[1:]
+    worst = np.zeros((-(-rows // _SIDE), -(-cols // _SIDE)), dtype=np.float32)
     limit = np.float32(LIMITS[REBLUR] ** 2)
     for c, (blur, sensor) in enumerate(zip(blurs, sensors, strict=True)):
-        K = blur.spectrum(grid)
-        scratch = np.empty_like(K)
+        rim = blur.reach
+        if min(rows, cols) <= 2 * rim:
+            continue  # light from beyond reaches all of it
 
-        def spread(plane: Plane, K: Complex = K, scratch: Complex = scratch) -> Real:
-            """A plane as the blur shows it, on its canvas."""
-            work = np.zeros(grid, dtype=np.float32)
-            work[: shape[0], : shape[1]] = plane
-            through(work, scratch, K, forward=True, first=0, last=shape[0], begin=0, end=shape[0])
-            return work
+        def spread(plane: Plane, blur: UniformBlur = blur) -> Real:
+            return np.pad(blur.forward(plane), blur.reach)
 
-        rim = min(blur.reach, (min(shape) - 1) // 2)
-        counted = np.zeros(shape, dtype=np.float32)
-        counted[rim : shape[0] - rim, rim : shape[1] - rim] = 1.0
+        counted = np.pad(np.ones((rows - 2 * rim, cols - 2 * rim), dtype=np.float32), rim)
         if sensor.measured is not None:
             counted *= sensor.measured
         clipped = y[c] >= np.float32(LEAST_CLIPPED * sensor.clip)
         if clipped.any():
-            counted *= spread(clipped)[: shape[0], : shape[1]] < _GLOW
+            counted *= spread(clipped.astype(np.float32)) < _GLOW
         error = max(errors[c], _MODEL_ERROR)
         allowed = np.array([sensor.noise.shot, sensor.noise.read, error**2], dtype=np.float32)
         blurred = spread(x[c])
-        sums = np.zeros((2, *worst.shape), dtype=np.float32)
-        _residual(y[c], x[c], blurred, blurred, counted, allowed, sums)
-        square, number = _around(sums)
-        number = np.maximum(number, np.float32(1.0))
+        square = _around(_residual(y[c], x[c], blurred, blurred, counted, allowed)[None])[0]
+        number = np.maximum(_around(block_sums(counted, _SIDE)[None])[0], np.float32(1.0))
         if (square > limit * number).any():  # else it does not matter what the photo itself leaves
-            sums[:] = 0.0
-            _residual(y[c], x[c], blurred, spread(y[c]), counted, allowed, sums)
-            number = np.maximum(number, _around(sums)[0] / limit)
+            own = _residual(y[c], x[c], blurred, spread(y[c]), counted, allowed)
+            number = np.maximum(number, _around(own[None])[0] / limit)
         np.maximum(worst, np.sqrt(square / number), out=worst)
     return worst
 
 
 @jit
-def _residual(
-    y: Real, x: Real, blurred: Real, explained: Real, counted: Real, allowed: Real, sums: Real
-) -> None:
-    """Sums over blocks of squares of what is not `explained` over what may be, and of what counts."""
-    rows, cols = y.shape
-    lines = np.zeros((2, cols), np.float32)
-    for i in range(rows):
-        for j in range(cols):
+def _residual(y: Real, x: Real, blurred: Real, explained: Real, counted: Real, allowed: Real) -> Real:
+    """Sums over blocks of squares of what is not `explained` over what may be, where it is `counted`."""
+    square = np.empty_like(y)
+    for i in range(y.shape[0]):
+        for j in range(y.shape[1]):
             left, change = y[i, j] - explained[i, j], x[i, j] - blurred[i, j]
-            variance = allowed[0] * max(y[i, j], np.float32(0.0)) + allowed[1] + allowed[2] * change * change
-            lines[0, j] += counted[i, j] * left * left / max(variance, np.float32(1e-12))
-            lines[1, j] += counted[i, j]
-        if i % 8 == 7 or i == rows - 1:
-            _into_blocks(lines, i, sums)
-            lines[:] = np.float32(0.0)
-
-
-def _blocks(shape: tuple[int, int]) -> tuple[int, int]:
-    return -(-shape[0] // _SIDE), -(-shape[1] // _SIDE)
+            variance = allowed[0] * max(y[i, j], ZERO) + allowed[1] + allowed[2] * change * change
+            square[i, j] = counted[i, j] * left * left / max(variance, np.float32(1e-12))
+    return block_sums(square, _SIDE)
 
 
 def _around(totals: Real) -> Real:
@@ -297,81 +271,3 @@ def _around(totals: Real) -> Real:
     for figures, into in zip(totals, out, strict=True):
         smooth(figures, _WEIGHTS, into, wrapped=False)
     return out
-
-
-@jit
-def _lower(keep: Real, shares: Real) -> None:
-    """Lower `keep` to the shares of blocks, interpolated between their middles, in place."""
-    rows, cols = shares.shape
-    line = np.empty(cols, np.float32)
-    for i in range(keep.shape[0]):
-        at = min(max((i - 3.5) / 8.0, 0.0), rows - 1.0)
-        a = min(int(at), max(rows - 2, 0))
-        t, b = np.float32(at - a), min(a + 1, rows - 1)
-        for j in range(cols):
-            line[j] = shares[a, j] + t * (shares[b, j] - shares[a, j])
-        for j in range(keep.shape[1]):
-            at = min(max((j - 3.5) / 8.0, 0.0), cols - 1.0)
-            a = min(int(at), max(cols - 2, 0))
-            keep[i, j] = min(
-                keep[i, j], line[a] + np.float32(at - a) * (line[min(a + 1, cols - 1)] - line[a])
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class HeldTile:
-    """A tile of the photo, by its first pixel, and the share of its correction that was held back."""
-
-    row: int
-    col: int
-    held_back: float
-
-
-@dataclass(frozen=True, slots=True)
-class ZoneAudit:
-    """What was held back in one zone."""
-
-    tiles: int  # how many were audited
-    tiles_held: int  # those of which more than a tenth was held back
-    held_back: float  # mean share of the correction that was held back, 0 to 1
-    checks: Mapping[str, float]  # the same by check, each as if alone; only those that held something back
-
-
-@dataclass(frozen=True, slots=True)
-class AuditReport:
-    """What the audit of a photo held back, why, and where."""
-
-    zones: Mapping[Zone, ZoneAudit]  # zones without a tile are left out
-    tiles: tuple[HeldTile, ...] = ()  # the map: those of which at least a hundredth was held back
-    tile_side: int = 0  # side of the square in pixels that a tile stands for; 0 where it is not known
-
-    @property
-    def held_back(self) -> float:
-        """Mean share of the correction that was held back, all tiles together."""
-        tiles = sum(zone.tiles for zone in self.zones.values())
-        return sum(zone.tiles * zone.held_back for zone in self.zones.values()) / tiles if tiles else 0.0
-
-
-def pooled(audits: Iterable[tuple[Zone, tuple[int, int], TileAudit]], tile_side: int = 0) -> AuditReport:
-    """Pool the audits of tiles, each with its zone and its first pixel in the photo."""
-    listed = list(audits)
-    zones = {
-        zone: _zone(in_zone)
-        for zone in ZONES
-        if (in_zone := [audit for name, _, audit in listed if name == zone])
-    }
-    held = tuple(
-        HeldTile(top, left, audit.held_back) for _, (top, left), audit in listed if audit.held_back >= _MAPPED
-    )
-    return AuditReport(zones, held, tile_side)
-
-
-def _zone(audits: list[TileAudit]) -> ZoneAudit:
-    shares = [audit.held_back for audit in audits]
-    checks = {name: float(np.mean([audit.checks.get(name, 0.0) for audit in audits])) for name in LIMITS}
-    return ZoneAudit(
-        len(audits),
-        sum(share > HELD for share in shares),
-        float(np.mean(shares)),
-        {name: share for name, share in checks.items() if share > 0.0},
-    )

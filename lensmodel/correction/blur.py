@@ -13,7 +13,6 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 import rocket_fft
-import scipy
 from numpy.typing import NDArray
 from scipy import fft
 
@@ -222,23 +221,6 @@ class UniformBlur:
         K = self.spectrum(grid)
         return np.zeros(grid, dtype=np.float32), np.empty_like(K), K
 
-    def covered(self, shape: tuple[int, ...]) -> Plane:
-        """Share of the light of each latent point that falls into a frame of `shape`: F^T 1, float32.
-
-        A point sees a rectangle of the kernel, so cumulative sums suffice and no transform is needed,
-        except for a shift by parts of a pixel.
-        """
-        if self.offset != (0.0, 0.0):
-            return self.adjoint(np.ones(shape, dtype=np.float32))
-        side = self.kernel.shape[0]
-        sums = np.pad(self.kernel.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-        # one axis after the other: four look-ups for each point of the plane take five times as long
-        for axis, extent in enumerate(shape):
-            start = side - 1 - np.arange(extent + side - 1)
-            above, below = np.clip(start, 0, side), np.clip(start + extent, 0, side)
-            sums = sums.take(below, axis) - sums.take(above, axis)
-        return sums.astype(np.float32)
-
     def frame(self, latent: Plane) -> Plane:
         """Return the part of the latent plane that the photo shows."""
         cut = self.reach
@@ -289,29 +271,17 @@ def transfers(
     A solver inverts K alone and takes the change as data. That converges only where the change is smaller
     than K, so it is limited to half of K at `reach` pixels from the middle.
     """
-    parts = [[(0, blur.taps, 1.0)] for blur in blurs]
+    K = np.stack([blur.spectrum(shape) for blur in blurs])
     drifts = [blur.drift for blur in blurs if blur.drift is not None]
-    if drifting := len(drifts) == len(blurs):
-        for drift, listed in zip(drifts, parts, strict=True):
-            for index, (before, after, pixels) in enumerate((drift.down, drift.across), start=1):
-                change = 1.0 / max(pixels, 1.0)
-                listed += [(index, before.taps, -change), (index, after.taps, change)]
-    side = max(kernel.shape[0] for listed in parts for _, kernel, _ in listed)
-    taps = np.zeros((len(blurs), 3 if drifting else 1, side, side), dtype=np.float32)
-    for c, listed in enumerate(parts):
-        for index, kernel, factor in listed:
-            low = (side - kernel.shape[0]) // 2
-            taps[c, index, low : side - low, low : side - low] += factor * kernel
-    half = shape[1] // 2 + 1
-    K = np.empty((len(blurs), shape[0], half), dtype=np.complex64)
-    rates = np.empty((len(drifts) if drifting else 0, 2, shape[0], half), dtype=np.complex64)
-    for c in range(len(blurs)):
-        transfer(taps[c, 0], K[c], shape[1])
-    for c in range(len(rates)):
-        transfer(taps[c, 1], rates[c, 0], shape[1])
-        transfer(taps[c, 2], rates[c, 1], shape[1])
-        change = np.float32(reach) * np.abs(rates[c]).sum(axis=0)
-        rates[c] *= np.minimum(np.float32(0.5) * np.abs(K[c]) / np.maximum(change, np.float32(1e-9)), ONE)
+    rates = np.empty((len(drifts), 2, *K.shape[1:]), dtype=np.complex64)
+    for spectrum, rate, drift in zip(K, rates, drifts, strict=bool(drifts)):
+        for out, (before, after, pixels) in zip(rate, (drift.down, drift.across), strict=True):
+            side = max(2 * blur.reach + 1 for blur in (before, after))
+            first, last = (np.pad(blur.taps, side // 2 - blur.reach) for blur in (before, after))
+            transfer((last - first) / np.float32(max(pixels, 1.0)), out, shape[1])
+        change = np.float32(reach) * np.abs(rate).sum(axis=0)
+        most = np.float32(0.5) * np.abs(spectrum)
+        np.multiply(rate, np.minimum(most / np.maximum(change, np.float32(1e-9)), ONE), out=rate)
     return K, rates
 
 
@@ -398,22 +368,30 @@ def block_sums(plane: Real, side: int) -> Real:
     return sums
 
 
-def spread_blocks(blocks: NDArray[np.float32], canvas: Canvas) -> NDArray[np.float32]:
-    """Interpolate a coarse plane linearly onto a canvas, its margin cross-faded like the data's."""
-    height, width = canvas.shape
-    across = _interpolation(canvas.cols, canvas.margin, width) @ np.ascontiguousarray(blocks.T)
-    return np.asarray(
-        _interpolation(canvas.rows, canvas.margin, height) @ np.ascontiguousarray(across.T), dtype=np.float32
-    )
+@jit
+def interpolated(blocks: Real, side: int, rows: int, cols: int) -> Real:
+    """Interpolate values of square blocks linearly between their middles, constant beyond these."""
+    plane, line = np.empty((rows, cols), np.float32), np.empty(blocks.shape[1] + 1, np.float32)
+    down, across = _between(rows, side), _between(cols, side)
+    for i in range(rows):
+        above, below = blocks[down[0][i]], blocks[min(down[0][i] + 1, blocks.shape[0] - 1)]
+        for k in range(blocks.shape[1]):
+            line[k] = above[k] + down[1][i] * (below[k] - above[k])
+        line[-1] = line[-2]
+        for j in range(cols):
+            k = across[0][j]
+            plane[i, j] = line[k] + across[1][j] * (line[k + 1] - line[k])
+    return plane
 
 
-@lru_cache(maxsize=64)
-def _interpolation(extent: int, margin: int, length: int) -> scipy.sparse.csr_array:
-    """Matrix that takes blocks of `extent` pixels to a canvas of `length`."""
-    starts = np.arange(0, extent, BLOCK)
-    middles = (starts + np.minimum(starts + BLOCK, extent) - 1) / 2.0
-    t = np.arange(extent)
-    fine = np.stack([np.interp(t, middles, row) for row in np.eye(starts.size)], axis=1).astype(np.float32)
-    first, second, fade = _seam(extent, length)
-    bridge = fine[first] * (1 - fade)[:, None] + fine[second] * fade[:, None]
-    return scipy.sparse.csr_array(np.roll(np.concatenate([fine, bridge]), margin, axis=0))
+@jit
+def _between(extent: int, side: int) -> tuple[NDArray[np.int64], Real]:
+    """The block before each pixel, and its distance from that block's middle over that to the next one's."""
+    last = (extent - 1) // side
+    index, share = np.zeros(extent, np.int64), np.zeros(extent, np.float32)
+    for i in range(extent if last > 0 else 0):
+        index[i] = min(max((2 * i - side + 1) // (2 * side), 0), last - 1)
+        start = side * index[i]
+        before, after = start + 0.5 * (side - 1), 0.5 * (start + side + min(start + 2 * side, extent) - 1)
+        share[i] = min(max((i - before) / (after - before), 0.0), 1.0)
+    return index, share

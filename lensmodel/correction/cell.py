@@ -25,7 +25,7 @@ from lensmodel.core.types import (
     Planes,
     zone_of,
 )
-from lensmodel.correction.audit import TileAudit, held_back
+from lensmodel.correction.audit import Audit, held_back
 from lensmodel.correction.blur import Drift, UniformBlur, fitted_halo
 from lensmodel.correction.deconvolver import Deconvolver, Sensor, Solution, restore_planes
 from lensmodel.correction.expected_gain import WORTH_DB, CellForecast, plan
@@ -232,7 +232,7 @@ class RestoredCell:
 
     planes: Planes
     forecast: CellForecast
-    audit: TileAudit | None
+    audit: Audit | None
     left: bool = False
     layers: tuple[Planes, ...] = ()
 
@@ -258,19 +258,14 @@ class _CellTile:
         top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
         part = job.planes[:, top : cell.bottom + halo, left : cell.right + halo]
         tile = np.ascontiguousarray(part, dtype=np.float32)
-        surrounded = (
-            min(cell.top - halo, cell.left - halo) >= 0
-            and cell.bottom + halo <= job.frame.height
-            and cell.right + halo <= job.frame.width
-        )
         edges = (
-            top == 0,
-            cell.bottom + halo >= job.frame.height,
-            left == 0,
-            cell.right + halo >= job.frame.width,
+            cell.top < halo,
+            cell.bottom + halo > job.frame.height,
+            cell.left < halo,
+            cell.right + halo > job.frame.width,
         )
         sensors = [
-            Sensor(job.noise[c], job.clip[c], job.measured(c, top, left, plane.shape), surrounded, edges)
+            Sensor(job.noise[c], job.clip[c], job.measured(c, top, left, plane.shape), edges)
             for c, plane in enumerate(tile)
         ]
         inner = (
@@ -345,7 +340,7 @@ def _checked(
     blurs: Sequence[UniformBlur],
     solution: Solution,
     softness: float,
-) -> tuple[Planes, TileAudit]:
+) -> tuple[Planes, Audit]:
     """Add back what the prior took, limit, audit; the cell without its halo."""
     photo, sensors, errors = tile.photo, tile.sensors, [posterior.error for posterior in tile.posteriors]
     restored = solution.planes

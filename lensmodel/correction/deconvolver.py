@@ -26,12 +26,9 @@ class Sensor:
         Level at and above which a value is only a lower bound; infinity where nothing clips.
     measured : ndarray of bool, shape (H, W), or None
         Where the sensor measured this plane; demosaicing filled in the rest. `None` for everywhere.
-    surrounded : bool
-        Whether a rim as wide as the reach of the blur will be cut off on all sides. What lies beyond the
-        plane then need not be solved for.
     edges : tuple of bool
-        Which sides of the plane (top, bottom, left, right) are sides of the frame. The others are cuts:
-        what lies beyond them was measured, but is not given.
+        Which sides of the plane (top, bottom, left, right) are sides of the frame. At the others a rim as
+        wide as the reach of the blur will be cut off: what lies beyond them need not be solved for.
 
     Raises
     ------
@@ -42,12 +39,16 @@ class Sensor:
     noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
     clip: float = float("inf")
     measured: NDArray[np.bool_] | None = None
-    surrounded: bool = False
     edges: tuple[bool, bool, bool, bool] = (True, True, True, True)
 
     def __post_init__(self) -> None:
         if not self.clip > 0.0:
             raise InvalidInputError(f"clip must be a positive level, got {self.clip}")
+
+    @property
+    def surrounded(self) -> bool:
+        """Whether no side of the plane is one of the frame."""
+        return not any(self.edges)
 
     def variance(self, plane: NDArray[np.floating]) -> NDArray[np.float32]:
         """Variance of the noise at each pixel of linear light."""

@@ -19,6 +19,8 @@ from lensmodel.correction.blur import (
     Complex,
     Real,
     UniformBlur,
+    block_sums,
+    interpolated,
     smooth,
     to_plane,
     to_spectrum,
@@ -131,57 +133,37 @@ def _filter(x: Real, K: Complex, over: Real, rise: Real, amplified: Real) -> Non
 
 
 @jit
-def _where_it_stands_out(  # noqa: C901, PLR0912 - blocks, then pixels
-    y: Real, x: Real, margin: int, noise: Real, out: Real
-) -> None:
+def _where_it_stands_out(y: Real, x: Real, margin: int, noise: Real, out: Real) -> None:
     """Mix planes and their filtered ones on a canvas by what the change costs in `noise`."""
     channels, rows, cols = y.shape
-    high, wide = -(-rows // _BLOCK), -(-cols // _BLOCK)
-    zero, one, part = np.float32(0.0), np.float32(1.0), np.float32(1.0 / channels)
-    change, light = np.empty(cols, np.float32), np.empty(cols, np.float32)
-    power, expected = np.zeros((high, wide), np.float32), np.zeros((high, wide), np.float32)
+    part = np.float32(1.0 / channels)
+    power, expected = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    change = np.empty(cols, np.float32)
     for i in range(rows):
-        change[:] = zero
-        light[:] = zero
+        change[:] = ZERO
+        expected[i] = ZERO
         for c in range(channels):
             before, after = y[c, i], x[c, margin + i, margin : margin + cols]
             shot, read = noise[c, 0] * part * part, noise[c, 1] * part * part
             for j in range(cols):
                 change[j] += part * (after[j] - before[j])
-                light[j] += shot * max(before[j], zero) + read
-        for b in range(wide):
-            square, total = zero, zero
-            for j in range(_BLOCK * b, min(_BLOCK * b + _BLOCK, cols)):
-                square += change[j] * change[j]
-                total += light[j]
-            power[i // _BLOCK, b] += square
-            expected[i // _BLOCK, b] += total
-    share, wider = np.empty((high, wide), np.float32), np.empty((high, wide), np.float32)
-    smooth(power, _AROUND, wider, False)
-    smooth(expected, _AROUND, share, False)
-    for i in range(high):
-        for j in range(wide):
-            cost = _SURE * share[i, j] / max(wider[i, j], np.float32(1e-20))
-            share[i, j] = min(max(one - cost, zero), one)
-    line, kept = np.empty(wide + 1, np.float32), np.empty(_BLOCK * (wide + 1), np.float32)
-    half, step = _BLOCK // 2, np.float32(1.0 / _BLOCK)
+                expected[i, j] += shot * max(before[j], ZERO) + read
+        for j in range(cols):
+            power[i, j] = change[j] * change[j]
+    blocks, share = block_sums(power, _BLOCK), block_sums(expected, _BLOCK)
+    wider, costs = np.empty_like(blocks), np.empty_like(blocks)
+    smooth(blocks, _AROUND, wider, False)
+    smooth(share, _AROUND, costs, False)
+    for i in range(blocks.shape[0]):
+        for j in range(blocks.shape[1]):
+            cost = _SURE * costs[i, j] / max(wider[i, j], np.float32(1e-20))
+            share[i, j] = min(max(ONE - cost, ZERO), ONE)
+    kept = interpolated(share, _BLOCK, rows, cols)
     for i in range(rows):
-        above = min(max((i - half) // _BLOCK, 0), high - 1)
-        below = min(above + 1, high - 1)
-        t = min(max((np.float32(i - half - _BLOCK * above) + np.float32(0.5)) * step, zero), one)
-        for b in range(wide):
-            line[b] = share[above, b] + t * (share[below, b] - share[above, b])
-        line[wide] = line[wide - 1]
-        for k in range(half):
-            kept[k] = line[0]
-        for b in range(wide):
-            for k in range(_BLOCK):
-                at = (np.float32(k) + np.float32(0.5)) * step
-                kept[half + _BLOCK * b + k] = line[b] + at * (line[b + 1] - line[b])
         for c in range(channels):
             before, after, into = y[c, i], x[c, margin + i, margin : margin + cols], out[c, i]
             for j in range(cols):
-                into[j] = before[j] + kept[j] * (after[j] - before[j])
+                into[j] = before[j] + kept[i, j] * (after[j] - before[j])
 
 
 @lru_cache(maxsize=16)

@@ -30,9 +30,8 @@ from lensmodel.core.types import (
     StepHook,
     Zone,
     ignore_step,
-    zone_of,
 )
-from lensmodel.correction.audit import AuditReport, pooled
+from lensmodel.correction.audit import Audit
 from lensmodel.correction.blur import Real, UniformBlur, crop_to_support
 from lensmodel.correction.cell import (
     Cell,
@@ -85,8 +84,6 @@ class ZoneReport:
     expected_gain_db: float | None
     psf_error: float  # mean expected relative error of the PSFs
     left: int = 0  # cells left as they were, because there was nothing to gain
-    held_back: float = 0.0  # mean share of the correction that the audit held back, 0 to 1
-    reasons: tuple[str, ...] = ()  # the checks that held something back, the strictest first
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,8 +97,8 @@ class Corrected:
     zones : dict of str to ZoneReport
         What the correction is expected to have gained, in decibels, in each zone of the field that it
         reaches: "center", "mid", "corner".
-    audit : AuditReport
-        How much was held back, why, and where most.
+    audit : Audit
+        Which share of the correction was held back, and why.
     chroma_step : tuple of int
         Rows and columns of pixels that share one value of chroma in the photo's file; where that is more than
         one pixel, chroma was corrected no more finely.
@@ -111,7 +108,7 @@ class Corrected:
 
     planes: Planes
     zones: dict[Zone, ZoneReport]
-    audit: AuditReport = field(default_factory=lambda: pooled(()))
+    audit: Audit = field(default_factory=Audit)
     chroma_step: tuple[int, int] = (1, 1)
     layers: tuple[Planes, ...] = ()
 
@@ -214,11 +211,10 @@ def correct_planes(
         forecasts.append(restored.forecast)
         left[restored.forecast.zone] += restored.left
         if restored.audit is not None:
-            audits.append((zone_of(cell.position.r), (cell.top, cell.left), restored.audit))
+            audits.append(restored.audit)
         on_step(done, len(window_cells))
-    report = pooled(audits, pitch)
     step = (1, 1) if stored is None else stored.step
-    return Corrected(out, zone_reports(forecasts, left, report), report, step, tuple(layer_planes))
+    return Corrected(out, zone_reports(forecasts, left), Audit.mean(audits), step, tuple(layer_planes))
 
 
 def _unchanged(
@@ -230,12 +226,10 @@ def _unchanged(
     left = Counter(forecast.zone for forecast in forecasts)
     bottom, right = window.top + window.height, window.left + window.width
     planes = np.array(job.planes[:, window.top : bottom, window.left : right], dtype=np.float32)
-    return Corrected(planes, zone_reports(forecasts, left, pooled(())))
+    return Corrected(planes, zone_reports(forecasts, left))
 
 
-def zone_reports(
-    forecasts: Sequence[CellForecast], left: Mapping[Zone, int], audit: AuditReport
-) -> dict[Zone, ZoneReport]:
+def zone_reports(forecasts: Sequence[CellForecast], left: Mapping[Zone, int]) -> dict[Zone, ZoneReport]:
     """Pool the cells of each zone; zones without a cell are left out."""
     reports: dict[Zone, ZoneReport] = {}
     for zone in ZONES:
@@ -244,15 +238,7 @@ def zone_reports(
             continue
         error = sum(f.psf_error for f in in_zone) / len(in_zone)
         gain = decibels(sum(f.before for f in in_zone), sum(f.after for f in in_zone))
-        held = audit.zones.get(zone)
-        reports[zone] = ZoneReport(
-            len(in_zone),
-            gain if error < _UNKNOWN else None,
-            error,
-            left=left.get(zone, 0),
-            held_back=0.0 if held is None else held.held_back,
-            reasons=() if held is None else tuple(sorted(held.checks, key=lambda name: -held.checks[name])),
-        )
+        reports[zone] = ZoneReport(len(in_zone), gain if error < _UNKNOWN else None, error, left.get(zone, 0))
     return reports
 
 

@@ -637,7 +637,7 @@ def spoilt(answer: Any, path: str, value: object) -> Any:
 
 SELECTION: dict[str, Any] = {"patches": [patch(0)], "rejected": [], "lateral": None}
 WINDOW = {"row": 0, "col": 0, "size": 64, "r": 0.1, "phi": 0.1, "reason": "flat"}
-CORRECTION = {"file": "a.jpg", "report": {"zones": {"mid": {}}, "audit": {"zones": {}, "tiles": []}}}
+CORRECTION = {"file": "a.jpg", "report": {"zones": {"mid": {}}, "audit": {"held_back": 0.1, "checks": {}}}}
 
 
 @pytest.mark.parametrize(
@@ -651,8 +651,8 @@ CORRECTION = {"file": "a.jpg", "report": {"zones": {"mid": {}}, "audit": {"zones
         (answers.SELECTED, spoilt(SELECTION, "patches.0.row", 2**70)),
         (answers.SELECTED, spoilt(SELECTION, "lateral", {"red": [1.0]})),
         (answers.CORRECTED, spoilt(CORRECTION, "report.zones", {"elsewhere": {}})),
-        (answers.CORRECTED, spoilt(CORRECTION, "report.zones.mid", {"reasons": ["x"] * 100})),
-        (answers.CORRECTED, spoilt(CORRECTION, "report.audit.tiles", [{"row": 1}])),
+        (answers.CORRECTED, spoilt(CORRECTION, "report.zones.mid", {"cells": -1})),
+        (answers.CORRECTED, spoilt(CORRECTION, "report.audit.held_back", 2.0)),
     ],
 )
 def test_what_no_task_gives_is_no_answer(kind: Any, answer: Any) -> None:

@@ -24,7 +24,7 @@ from app.jobs import tasks
 from app.jobs.answers import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
 from app.jobs.sample_files import write_samples
 from app.main import create_app
-from app.pages.routes import templates, unused_name
+from app.pages.routes import unused_name
 from app.pages.shown import cell_px, grouped
 from app.runtime.settings import Settings
 from app.store import LensName, Store
@@ -32,9 +32,7 @@ from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from lab.kernels import gaussian
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import CHANNELS, FieldPosition, Frame, LensSettings, ignore_step
-from lensmodel.correction.cell import cells
-from lensmodel.photo import upright
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 from lensmodel.photo.writing import write_bayer_dng
 
 PNG8 = {"method": "fast", "strength": 1.0, "output": {"format": "png8"}, "roi": None}
@@ -132,11 +130,7 @@ def corrected(
     for name in SIDES.values():
         write_tiles(tmp_path / name, CORNERED)
         storage.put(f"corrections/{made['id']}/1-1/{name}", tmp_path / name)
-    audit = {
-        "zones": {"center": {"tiles": 4, "tiles_held": 1, "held_back": 0.1, "checks": {"re-blur": 0.1}}},
-        "tiles": [{"row": 0, "col": 200, "held_back": 0.4}],
-        "tile_side": 100,
-    }
+    audit = {"held_back": 0.1, "checks": {"re-blur": 0.1}}
     report = {"zones": {}, "nothing_to_correct": getattr(request, "param", False), "audit": audit}
     finish(client, made["id"], b"a", report=report, media_type="image/x-adobe-dng", name="p.dng")
     return made
@@ -183,40 +177,6 @@ def test_damaged_tiles_are_refused(client: TestClient, corrected: dict[str, Any]
         for name in ("whole", "0/0_0"):
             answer = client.get(f"/ui/corrections/{corrected['id']}/tiles/after/{name}.jpg")
             assert answer.status_code == 409, (change, name)
-
-
-def held_tiles(audit: dict[str, Any], height: int, width: int, orientation: int) -> list[list[int]]:
-    """Return left, top, right and bottom of what is drawn of each tile, in the upright photo."""
-    macros: Any = templates.get_template("_gain.html").module
-    drawn = str(macros.held_map(audit, height, width, orientation))
-    numbers = re.search(r"matrix\((.*?)\)", drawn)
-    assert numbers is not None
-    a, b, c, d, e, f = map(int, numbers[1].split())
-    tiles = []
-    for rect in re.findall(r'<rect x="(\d+)" y="(\d+)" width="(\d+)" height="(\d+)"', drawn):
-        x, y, across, down = map(int, rect)
-        ends = [(a * u + c * v + e, b * u + d * v + f) for u, v in ((x, y), (x + across, y + down))]
-        tiles.append([*map(min, zip(*ends, strict=True)), *map(max, zip(*ends, strict=True))])
-    return tiles
-
-
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_what_was_held_back_is_drawn_once_and_turned_as_the_photo_is(orientation: int) -> None:
-    marked = np.zeros((331, 503), np.int8)
-    marked[:96, 96:192] = 1  # near the tile, whose ends lie on a lattice without gaps
-    turned = upright(marked, orientation)
-    rows, cols = np.nonzero(turned)
-    audit = {"tiles": [{"row": 0, "col": 101, "held_back": 0.4}], "tile_side": 96}
-
-    (found,) = held_tiles(audit, 331, 503, orientation)
-
-    wanted = [cols.min(), rows.min(), cols.max() + 1, rows.max() + 1]
-    assert np.abs(np.subtract(found, wanted)).max() <= 18
-    tiles = [{"row": c.top, "col": c.left, "held_back": 0.4} for c in cells(Frame(331, 503), 96)]
-    drawn = np.zeros(turned.shape, np.int8)
-    for left, top, right, bottom in held_tiles({"tiles": tiles, "tile_side": 96}, 331, 503, orientation):
-        drawn[top:bottom, left:right] += 1
-    assert drawn.min() == drawn.max() == 1
 
 
 @unchanged

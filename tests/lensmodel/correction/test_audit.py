@@ -14,17 +14,7 @@ from scipy import ndimage
 from lab.kernels import gaussian
 from lensmodel.core.files import from_json, to_json
 from lensmodel.core.types import NoiseModel, Plane, Planes
-from lensmodel.correction.audit import (
-    LIMITS,
-    AuditReport,
-    HeldTile,
-    TileAudit,
-    Window,
-    ZoneAudit,
-    held_back,
-    kept_shares,
-    pooled,
-)
+from lensmodel.correction.audit import LIMITS, Audit, Window, held_back, kept_shares
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
 
@@ -205,13 +195,11 @@ def test_the_inner_part_is_judged_with_what_is_around() -> None:
     assert np.array_equal(keep, kept(PHOTO, spoiled)[0][inner])
 
 
-def test_a_report_names_zone_check_and_tile_and_takes_means_over_tiles() -> None:
-    clean = TileAudit(0.0, {"re-blur": 0.0, "spectrum": 0.0})
-    bad = TileAudit(0.5, {"re-blur": 0.5, "spectrum": 0.0})
+def test_the_audit_of_a_photo_is_the_mean_over_its_tiles() -> None:
+    clean, bad = Audit(0.0, {"re-blur": 0.0, "spectrum": 0.0}), Audit(0.5, {"re-blur": 0.5, "spectrum": 0.0})
 
-    report = pooled([("mid", (0, 0), clean), ("mid", (0, 160), bad)], 160)
+    report = Audit.mean([clean, bad])
 
-    assert report.zones == {"mid": ZoneAudit(2, 1, 0.25, {"re-blur": 0.25})}
-    assert report.tiles == (HeldTile(0, 160, 0.5),)
-    assert report.held_back == pytest.approx(0.25)
-    assert from_json(AuditReport, to_json(report)) == report
+    assert report == Audit(0.25, {"re-blur": 0.25})
+    assert Audit.mean([]) == Audit()
+    assert from_json(Audit, to_json(report)) == report

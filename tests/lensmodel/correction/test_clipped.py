@@ -73,15 +73,6 @@ def test_lamps_far_apart_shine_as_each_does_alone() -> None:
     np.testing.assert_allclose(found.rest[here], alone.rest[here], atol=1e-5)
 
 
-@pytest.mark.parametrize("shape", [(30, 41), (5, 60), (3, 3)])
-def test_covered_light_is_the_adjoint_of_a_frame_of_ones(shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(1)
-    kernel = rng.random((7, 7)) ** 3
-    for blur in (UniformBlur(kernel / kernel.sum()), UniformBlur(kernel / kernel.sum(), (0.3, -0.6))):
-        expected = blur.adjoint(np.ones(shape, dtype=np.float32))
-        np.testing.assert_allclose(blur.covered(shape), expected, atol=2e-6)
-
-
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.4)])
 def test_lights_behind_next_to_no_blur_do_not_run_away(shift: tuple[float, float]) -> None:
     # eight bits just below clipping, as a JPEG of a white wall has them, and lateral colour

@@ -32,8 +32,6 @@ from lensmodel.photo import PhotoMetadata
 from lensmodel.photo.values import CORRECTED
 
 AHEAD: Final = 32  # photos that are sent to an executor at once (chosen): a gigabyte, work for dozens
-_SAME_STOPS: Final = 1.0 / 3.0  # apertures nearer than this are one setting: cameras set thirds of a stop
-_ONE_FOCAL: Final = 0.02  # of the focal length: what rounding in metadata changes
 
 
 class LensStore:
@@ -59,21 +57,13 @@ Sampler = Callable[[str, Admit], Sequence[PsfSample]]
 class Calibration:
     """A lens that learns from one photo after the other, kept in a store.
 
-    `pool` estimates the cells of all photos; `replace` drops what was learned blindly at the settings of new,
-    measured samples.
+    `pool` estimates the cells of all photos.
     """
 
     def __init__(
-        self,
-        store: LensStore,
-        config: Config,
-        *,
-        any_lens: bool = False,
-        replace: bool = False,
-        pool: Executor | None = None,
+        self, store: LensStore, config: Config, *, any_lens: bool = False, pool: Executor | None = None
     ) -> None:
-        self._store, self._config = store, config
-        self._any_lens, self._replace, self._pool = any_lens, replace, pool
+        self._store, self._config, self._any_lens, self._pool = store, config, any_lens, pool
 
     @property
     def known(self) -> Lens | None:
@@ -128,17 +118,12 @@ class Calibration:
         if lens is None:
             known = LensProfile(LensModel.fit(samples, self._config.model))
         else:
-            model = joined(lens.model, samples, replace=self._replace)
-            known = dataclasses.replace(lens.profile, model=model)
+            known = dataclasses.replace(lens.profile, model=lens.model.added(samples))
         names = known.lens
         if lens is None or not self._any_lens:  # a photo that may be of another lens does not name this one
             names = {**identity.names, **names}
         cameras = tuple(dict.fromkeys([*known.cameras, *identity.cameras]))
-        photos = {**known.photos, key: path.name}
-        if self._replace:  # which may have taken all samples of a photo
-            left = {sample.photo for sample in known.model.samples}
-            photos = {name: label for name, label in photos.items() if name in left}
-        self._store.keep(Lens(LensProfile(known.model, names, photos, cameras)))
+        self._store.keep(Lens(LensProfile(known.model, names, {**known.photos, key: path.name}, cameras)))
         return len(samples)
 
     def _sampled(
@@ -180,20 +165,3 @@ class Calibration:
                 f"it seems to be of another lens: {why}; give it a profile of its own, or allow it "
                 "(--any-lens, any_lens=True)"
             )
-
-
-def joined(model: LensModel, samples: Sequence[PsfSample], *, replace: bool = False) -> LensModel:
-    """Add samples to a model; `replace` drops its blind ones of the same settings."""
-    if not replace:
-        return model.added(samples)
-    kept = [old for old in model.samples if old.measured or not any(_alike(old, new) for new in samples)]
-    return LensModel.fit([*kept, *samples], model.mode)
-
-
-def _alike(old: PsfSample, new: PsfSample) -> bool:
-    """Whether two samples are of one setting of the lens."""
-    a, b = old.settings.stops, new.settings.stops
-    if a is not None and b is not None and abs(a - b) >= _SAME_STOPS:
-        return False
-    f, g = old.settings.focal_mm, new.settings.focal_mm
-    return f is None or g is None or abs(f - g) < _ONE_FOCAL * g

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from lab.images import zone_masks
 from lab.population.library import FAMILIES, Family, load_shard, numbered
 from lensmodel.core.files import atomic
-from lensmodel.core.psf import KINDS
 from lensmodel.core.types import ZONES
-from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork
+from lensmodel.neural import FieldAnswer, FieldNetwork
 from lensmodel.neural.network import assembled, outer_cells
 from lensmodel.neural.statistics import from_octant_image, group, octant_of, to_octant_image
 
@@ -132,25 +131,17 @@ def draw_set(lens: Lens, samples: int, queries: int, rng: np.random.Generator, *
     )  # fmt: skip
 
 
-def conditions_of(settings: NDArray[np.float64]) -> Conditions:
-    """Turn a row of settings back into what it was made of."""
-    f_number, width, focal, focus = (None if math.isnan(v) else math.exp(v) for v in settings[:4])
-    pitch = None if None in (f_number, width) else 0.54 * f_number / width  # type: ignore[operator]
-    return Conditions(f_number, pitch, focal, focus, KINDS[int(settings[4])])
-
-
 def _answers(network: FieldNetwork, drawn: Set) -> Iterator[tuple[FieldAnswer, NDArray[np.float64]]]:
     """What the network answers to each query of a set, and the true kernels."""
     parts = [np.flatnonzero(drawn.photo == photo) for photo in np.unique(drawn.photo)]
     encoded = [
-        network.encode(drawn.statistics[part], drawn.xy[part], conditions_of(drawn.settings[part][0]))
-        for part in parts
+        network.encode(drawn.statistics[part], drawn.xy[part], drawn.settings[part][0]) for part in parts
     ]
     tokens = np.concatenate(encoded)[np.argsort(np.concatenate(parts))].astype(np.float32)
-    memory = network.memory(tokens, drawn.xy, [conditions_of(row) for row in drawn.settings])
+    memory = network.memory(tokens, drawn.xy, drawn.settings)
     for xy, row, shares in zip(drawn.query_xy, drawn.query_settings, drawn.truth, strict=True):
         truth = from_octant_image(int(octant_of(xy)), assembled(shares))
-        yield network.query(memory, xy, conditions_of(row)), truth
+        yield network.query(memory, xy, row), truth
 
 
 def _relative(kernels: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:

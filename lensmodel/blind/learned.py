@@ -25,7 +25,7 @@ from lensmodel.core.types import (
     StepHook,
     ignore_step,
 )
-from lensmodel.neural import Conditions, FieldNetwork
+from lensmodel.neural import FieldNetwork, conditions_of
 from lensmodel.neural.statistics import WINDOW, patch_statistics, to_octant
 from lensmodel.patches.select import Patch, Selection, spread_evenly
 from lensmodel.photo.values import LinearPhoto
@@ -66,7 +66,7 @@ class LearnedEstimator:
         network = FieldNetwork.load()
         # only a Bayer mosaic holds the samples of the sensor
         kind: PatchKind = "jpeg" if developed.info.kind == "jpeg" else "raw" if developed.cfa else "tiff"
-        conditions = Conditions.of(settings, developed.info.metadata.pixel_pitch_um, kind)
+        conditions = conditions_of(settings, developed.info.metadata.pixel_pitch_um, kind)
         xy = np.array([patch.position.xy for patch in patches])
         rows = []
         for done, patch in enumerate(patches, start=1):
@@ -79,7 +79,7 @@ class LearnedEstimator:
         for patch, own, token, place in zip(patches, statistics, tokens, xy, strict=True):
             encoded = EncodedPatch(own, token, kind)
             # what the network says of the place of a patch from that patch alone
-            alone = network.memory(token[None].astype(np.float32), place[None], [conditions])
+            alone = network.memory(token[None].astype(np.float32), place[None], conditions)
             answer = network.query(alone, place, conditions)
             side = _side(answer.kernels, size)
             for channel, kernel, error in zip(CHANNELS, answer.kernels, answer.error, strict=True):
@@ -112,7 +112,7 @@ class LearnedEstimator:
         The middle 128 pixels of a patch are used; a smaller one is continued by its mirror image.
         """
         kept = usable(patches, noise, size)
-        network, conditions = FieldNetwork.load(), Conditions()
+        network, conditions = FieldNetwork.load(), conditions_of(LensSettings(), None)
         colours = _colours(_MOSAIC, 0, 0)
         xy = np.tile(_ANYWHERE.xy, (len(kept), 1))
         rows = [
@@ -120,7 +120,7 @@ class LearnedEstimator:
             for plane, model in kept
         ]
         tokens = network.encode(to_octant(np.stack(rows), xy), xy, conditions)
-        memory = network.memory(tokens, xy, [conditions] * len(kept))
+        memory = network.memory(tokens, xy, conditions)
         answer = network.query(memory, xy[0], conditions)
         return finished(answer.kernels[1], size=size, error=float(answer.error[1]))
 

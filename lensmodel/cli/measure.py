@@ -33,12 +33,6 @@ def measure(
     size: Annotated[
         int, typer.Option(min=9, max=101, callback=console.odd, help="Side of a PSF in pixels, odd.")
     ] = 31,
-    replace_blind: Annotated[
-        bool,
-        typer.Option(
-            "--replace", help="Drop what was learned blindly at the same aperture and focal length."
-        ),
-    ] = False,
     any_lens: console.AnyLens = False,
     json_output: console.Json = False,
     quiet: console.Quiet = False,
@@ -60,7 +54,7 @@ def measure(
 
         lensmodel measure target page.dng --profile my-24mm.lensprofile
 
-        lensmodel measure pair open.dng closed.dng --profile my-24mm.lensprofile --replace
+        lensmodel measure pair open.dng closed.dng --profile my-24mm.lensprofile
 
     Exit status: 0 all photos were used, 1 some were not, 2 wrong usage.
     """
@@ -71,7 +65,7 @@ def measure(
         groups = measuring.measurements_of(kind, paths)
         store = files.ProfileFile(profile)
         config = configured(store.model, LensSettings(aperture=aperture))
-        calibration = Calibration(store, config, any_lens=any_lens, replace=replace_blind)
+        calibration = Calibration(store, config, any_lens=any_lens)
     results: list[dict[str, Any]] = []
     with shown.progress(total=len(groups)) as bar:
         for number, group in enumerate(groups):

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -132,28 +131,23 @@ class HeldOut:
         free = np.maximum(1.0 - (weight**2).sum(axis=1), 0.1)
         return np.asarray(np.maximum(spread, 0.0) / free / self._own)
 
-    def score(self, r: float, phi: float) -> float:
-        """Mean error by weight at multiples of the bandwidths; gross errors count at most 1.5."""
-        errors = self.errors(self.weights(r, phi))
-        return float(np.average(np.minimum(errors, _CAP), weights=np.maximum(self.claims, 1e-9)))
-
     def best_factors(self) -> tuple[float, float]:
-        """Search the factors on r and phi, by turns, for the least held-out error."""
+        """Search the factors on r and phi, by turns, for the least mean held-out error by weight."""
 
         def best(options: list[tuple[float, float]]) -> tuple[float, float]:
+            errors = [np.minimum(self.errors(self.weights(*option)), _CAP) for option in options]
+            scores = np.average(errors, axis=1, weights=np.maximum(self.claims, 1e-9))
             # the least reach among those that are as good: far neighbours cost time and trust in a symmetry
-            scores = {option: self.score(*option) for option in options}
-            most = min(scores.values()) * _AS_GOOD + _NEGLIGIBLE
-            return next(option for option, score in scores.items() if score <= most)
+            return options[int((scores <= scores.min() * _AS_GOOD + _NEGLIGIBLE).argmax())]
 
-        chosen = (1.0, 1.0)
+        r, phi = 1.0, 1.0
         for _ in range(2):
-            before = chosen
-            chosen = best([(factor, chosen[1]) for factor in MULTIPLES])
-            chosen = best([(chosen[0], factor) for factor in PHI_MULTIPLES])
-            if chosen == before:
+            before = r, phi
+            r, phi = best([(factor, phi) for factor in MULTIPLES])
+            r, phi = best([(r, factor) for factor in PHI_MULTIPLES])
+            if (r, phi) == before:
                 break
-        return chosen
+        return r, phi
 
     def robust(
         self, photos: NDArray[np.intp], factors: tuple[float, float]
@@ -187,45 +181,35 @@ def _biweight(
     return np.asarray(np.where(t < 1.0, (1.0 - t * t) ** 2, 0.0))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CrossValidation:
-    """What the samples say of each other."""
-
-    # (n,), weights after robust weighting; held-out relative L2; the part of its square that is the samples'
-    # own scatter
-    weights: NDArray[np.float64]
-    errors: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    factors: tuple[float, float] = (1.0, 1.0)  # on the bandwidths in r and phi
-
-
 def cross_validate(
     samples: Sequence[PsfSample],
     mode: str,
     upright: Callable[[NDArray[np.intp]], NDArray[np.float64]],
     where: NDArray[np.float64],
     base: NDArray[np.float64],
-) -> CrossValidation:
-    """Choose bandwidths by cross-validation, weigh samples robustly; `upright` gives the kernels of rows."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
+    """Choose bandwidths by cross-validation, weigh samples robustly; `upright` gives the kernels of rows.
+
+    Returns (n,) weights, held-out relative L2, and the part of its square that is the samples' own scatter;
+    and the factors on the bandwidths in r and phi.
+    """
     paper = mode == PAPER
     photo = np.unique([s.photo for s in samples], return_inverse=True)[1]
     groups, scale = _held_together(photo, where[:, 5]), query.scales(bandwidths(where, mode))
     counting = np.flatnonzero(base > 0)
-    automatic = not paper and len(np.unique(photo[counting])) >= _CV_PHOTOS
-    searched = _thinned(counting[_judging(where[counting, 4])], _CV_SAMPLES)
     scored = _thinned(counting, _SCORED)
     errors, noise = np.full(len(samples), _UNKNOWN_ERROR), np.zeros(len(samples))
     if len(scored) < _FEWEST:
-        return CrossValidation(base, errors, noise)
+        return base, errors, noise, (1.0, 1.0)
 
     def held(rows: NDArray[np.intp], weights: NDArray[np.float64]) -> HeldOut:
         kernels = upright(rows).reshape(len(rows), -1)
         return HeldOut(kernels, where[rows], scale, weights[rows], groups[rows])
 
     def searched_factors(weights: NDArray[np.float64]) -> tuple[float, float]:
-        if not automatic:
+        if paper or len(np.unique(photo[counting])) < _CV_PHOTOS:
             return 1.0, 1.0
-        return held(searched, weights).best_factors()
+        return held(_thinned(counting[_judging(where[counting, 4])], _CV_SAMPLES), weights).best_factors()
 
     factors, weights = searched_factors(base), base
     prepared = held(scored, base)
@@ -236,12 +220,12 @@ def cross_validate(
         of_photos[known] = by_photo
         weights = base * of_photos[photo]
         weights[scored] *= by_sample
-        if bool((by_photo < _SPOILT).any()) or bool((by_sample < _SPOILT).any()):
+        if min(by_photo.min(), by_sample.min()) < _SPOILT:
             factors = searched_factors(weights)
     scatter = np.minimum(prepared.noise(prepared.weights(*factors)), held_out**2)
     errors[:], noise[:] = float(np.median(held_out)), float(np.median(scatter))
     errors[scored], noise[scored] = held_out, scatter
-    return CrossValidation(weights, errors, noise, factors)
+    return weights, errors, noise, factors
 
 
 def _held_together(photo: NDArray[np.intp], octaves: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -21,7 +21,7 @@ from lensmodel.core.psf import KINDS, PatchKind, PsfSample, centred
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, query
 from lensmodel.model.query import Part
-from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, Memory
+from lensmodel.neural import FieldAnswer, FieldNetwork, Memory, conditions_of
 
 NEAREST: Final = 256  # samples that a question attends to (chosen: the patches of three photos)
 
@@ -39,12 +39,17 @@ class LearnedField:
 
     def __init__(self, samples: Sequence[PsfSample]) -> None:
         self.network = FieldNetwork.load()
-        self._conditions = [
-            Conditions.of(s.settings, s.pixel_pitch_um, s.encoded.kind) for s in samples if s.encoded
-        ]
+        kinds = [sample.encoded.kind for sample in samples if sample.encoded is not None]
+        self._kind = np.array([KINDS.index(kind) for kind in kinds])
+        self._conditions = np.array(
+            [
+                conditions_of(s.settings, s.pixel_pitch_um, kind)
+                for s, kind in zip(samples, kinds, strict=True)
+            ]
+        )
         self._tokens = _tokens(samples, self._conditions, self.network)
         self._xy = np.array([s.position.xy for s in samples])  # half diagonals, to the right and up
-        self._where = query.all_in_units(samples)
+        self._where = np.array([query.in_units(s.position, s.settings) for s in samples])
         unknown = np.isnan(self._where)
         columns = zip(self._where.T, ~unknown.T, strict=True)
         self._usual = np.array([np.median(column[has]) if has.any() else 0.0 for column, has in columns])
@@ -79,18 +84,17 @@ class LearnedField:
         cell = np.round(query.in_units(position, settings) / _CELL)
         steps = tuple(None if np.isnan(step) else float(step) for step in cell)
         rows, memory, kind = self._memory(own, () if len(self._tree(own)[0]) <= NEAREST else steps)
-        conditions = Conditions.of(settings, own, kind)
-        return self.network.query(memory, np.array(position.xy), conditions), rows, own
+        asked = conditions_of(settings, own, kind)
+        return self.network.query(memory, np.array(position.xy), asked), rows, own
 
     def _memory_of(
         self, pitch_um: float | None, cell: tuple[float | None, ...]
     ) -> tuple[NDArray[np.intp], Memory, PatchKind]:
         """Samples near a cell of places, or all; their keys and values; the usual kind of files."""
         rows = self._nearest(pitch_um, np.array(cell, dtype=np.float64)) if cell else self._tree(pitch_um)[0]
-        conditions = [self._conditions[int(row)] for row in rows]
-        kinds = [one.kind for one in conditions]
-        memory = self.network.memory(self._tokens[rows].astype(np.float32), self._xy[rows], conditions)
-        return rows, memory, max(KINDS, key=kinds.count)
+        tokens = self._tokens[rows].astype(np.float32)
+        memory = self.network.memory(tokens, self._xy[rows], self._conditions[rows])
+        return rows, memory, KINDS[int(np.bincount(self._kind[rows]).argmax())]
 
     def _nearest(self, pitch_um: float | None, cell: NDArray[np.float64]) -> NDArray[np.intp]:
         """The `NEAREST` samples of a pitch, as many of each photo."""
@@ -123,17 +127,17 @@ class LearnedField:
 
 
 def _tokens(
-    samples: Sequence[PsfSample], conditions: Sequence[Conditions], network: FieldNetwork
+    samples: Sequence[PsfSample], conditions: NDArray[np.float64], network: FieldNetwork
 ) -> NDArray[np.float16]:
     """Tokens of samples; those that other weights made are made anew of the statistics, photo by photo."""
     encoded = [sample.encoded for sample in samples if sample.encoded is not None]
     tokens = np.array([patch.token for patch in encoded], dtype=np.float16)
-    stale: dict[tuple[str, Conditions], list[int]] = {}
+    stale: dict[tuple[str, bytes], list[int]] = {}
     for row, sample in enumerate(samples):
         if not sample.estimator.endswith(f"/{network.name}"):
-            stale.setdefault((sample.photo, conditions[row]), []).append(row)
-    for (_, of_photo), rows in stale.items():
+            stale.setdefault((sample.photo, conditions[row].tobytes()), []).append(row)
+    for rows in stale.values():
         statistics = np.array([encoded[row].statistics for row in rows], dtype=np.float32)
         xy = np.array([samples[row].position.xy for row in rows])
-        tokens[rows] = network.encode(statistics, xy, of_photo)
+        tokens[rows] = network.encode(statistics, xy, conditions[rows[0]])
     return tokens

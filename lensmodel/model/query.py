@@ -90,11 +90,6 @@ def in_units(position: FieldPosition, settings: LensSettings) -> NDArray[np.floa
     return np.array([*position.xy, *_numbers(settings)]) / UNITS
 
 
-def all_in_units(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
-    """Places and settings of samples in `UNITS`, shape (n, 5)."""
-    return np.array([in_units(s.position, s.settings) for s in samples])
-
-
 @dataclass(frozen=True, slots=True)
 class Support:
     """Distance to the nearest sample in units, and in which of `VARIABLES` all samples are far."""

@@ -121,13 +121,15 @@ class Regression:
         points = query.points(common)
         self._widths = WidthField() if mode == PAPER else WidthField.fit(common, base)
         self._local = LocalKernels.of(common, points, self._widths)
-        self._validation = cross_validate(common, mode, self._local.upright, points, base)
-        self._where = query.all_in_units(common)
+        weights, self._held_out, self._scatter, factors = cross_validate(
+            common, mode, self._local.upright, points, base
+        )
+        self._where = np.array([query.in_units(s.position, s.settings) for s in common])
         # what the estimators expect of their samples; 0 where they expect nothing
         self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
         self._photos = np.array([s.photo for s in samples], dtype=object)
-        self.bandwidth = bandwidths(points, mode, self._validation.factors)
-        self._around = Neighbourhood(points, self._validation.weights, query.scales(self.bandwidth))
+        self.bandwidth = bandwidths(points, mode, factors)
+        self._around = Neighbourhood(points, weights, query.scales(self.bandwidth))
 
     def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:
         """Answer at a place, in pixels of some pitch."""
@@ -171,8 +173,8 @@ class Regression:
         weight, rows = near.weights, near.rows
         _, number = np.unique(self._photos[rows].astype(str), return_inverse=True)
         independent = 1.0 / float((np.bincount(number, weight) ** 2).sum())
-        held_out = float(weight @ self._validation.errors[rows] ** 2)
-        scatter = min(float(weight @ self._validation.noise[rows]), held_out)
+        held_out = float(weight @ self._held_out[rows] ** 2)
+        scatter = min(float(weight @ self._scatter[rows]), held_out)
         own = max(held_out - scatter * (1.0 + 1.0 / independent), held_out / 9.0) + scatter / independent
         expected = float(weight @ self._expected[rows] ** 2)
         if len(self._where) == 1 and expected > 0.0:

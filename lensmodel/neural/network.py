@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -48,28 +48,17 @@ _GREEN_UM: Final = 0.54
 SETTINGS: Final = 5  # columns: logarithms of f-number, diffraction width (px), focal length, focus; the kind
 
 
-@dataclass(frozen=True, slots=True)
-class Conditions:
-    """What is known of how a patch was taken, or of what is asked for: positive, or None for unknown."""
+def conditions_of(
+    settings: LensSettings, pitch_um: float | None, kind: PatchKind = "raw"
+) -> NDArray[np.float64]:
+    """What is known of how a patch was taken, or of what is asked for, (SETTINGS,); unknown is NaN.
 
-    f_number: float | None = None
-    pitch_um: float | None = None  # of a pixel
-    focal_mm: float | None = None
-    focus_m: float | None = None
-    kind: PatchKind = "raw"  # samples of the mosaic, developed planes, or those of a camera
-
-    @classmethod
-    def of(cls, settings: LensSettings, pitch_um: float | None, kind: PatchKind) -> Conditions:
-        """Take them from settings of a lens; infinite focus is that of `FAR_M`."""
-        focus_m = None if settings.focus_m is None else min(settings.focus_m, FAR_M)
-        return cls(settings.aperture, pitch_um, settings.focal_mm, focus_m, kind)
-
-    def row(self) -> NDArray[np.float64]:
-        """As numbers, float64 of shape (SETTINGS,); unknown ones are NaN."""
-        width = None if None in (self.f_number, self.pitch_um) else _GREEN_UM * self.f_number / self.pitch_um  # type: ignore[operator]
-        values = (self.f_number, width, self.focal_mm, self.focus_m)
-        logs = [math.nan if value is None else math.log(value) for value in values]
-        return np.array([*logs, float(KINDS.index(self.kind))])
+    `kind`: samples of the mosaic, developed planes, or those of a camera; infinite focus is that of `FAR_M`.
+    """
+    given = (settings.aperture, pitch_um, settings.focal_mm, settings.focus_m)
+    f_number, pitch, focal, focus = (math.nan if value is None else value for value in given)
+    values = (f_number, _GREEN_UM * f_number / pitch, focal, min(focus, FAR_M))
+    return np.array([*map(math.log, values), float(KINDS.index(kind))])
 
 
 def place_features(xy: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -245,7 +234,7 @@ class FieldNetwork:
         return sorted({".".join(name.split(".")[:2]) for name in self.weights if name.startswith(part + ".")})
 
     def encode(
-        self, statistics: NDArray[np.floating], xy: NDArray[np.floating], conditions: Conditions
+        self, statistics: NDArray[np.floating], xy: NDArray[np.floating], conditions: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Tokens (n, d) of the patches of one photo, whose order does not matter to any of them.
 
@@ -259,7 +248,7 @@ class FieldNetwork:
             )
         if not (np.isfinite(statistics).all() and np.isfinite(xy).all()):
             raise InvalidInputError("statistics and places must be finite; leave patches out that are not")
-        rows = np.broadcast_to(conditions.row(), (len(xy), conditions.row().size))
+        rows = np.broadcast_to(conditions, (len(xy), SETTINGS))
         x = np.clip((statistics - self.weights["mean"]) / self.weights["spread"], -_CLAMP, _CLAMP)
         x = np.concatenate([x, condition_features(rows), place_features(xy)], -1)
         t = _gelu(self._linear("enter", x))
@@ -271,21 +260,20 @@ class FieldNetwork:
         return t
 
     def memory(
-        self, tokens: NDArray[np.floating], xy: NDArray[np.floating], conditions: Sequence[Conditions]
+        self, tokens: NDArray[np.floating], xy: NDArray[np.floating], conditions: NDArray[np.float64]
     ) -> Memory:
-        """Keys and values of samples (n, d) of any photos; they do not depend on what will be asked."""
+        """Keys and values of samples (n, d) of any photos; `conditions` are of each, or of all."""
         if not len(tokens):
             raise NoSamplesError("no sample of the lens; calibrate it with photos first")
         tokens = np.asarray(tokens, np.float32)
         pairs = [self._keys(block, tokens) for block in self._blocks("decoder")]
-        rows = np.array([c.row() for c in conditions])
-        return Memory(
-            np.asarray(xy, np.float64), rows, np.stack([k for k, _ in pairs]), np.stack([v for _, v in pairs])
-        )
+        keys, values = (np.stack(parts) for parts in zip(*pairs, strict=True))
+        rows = np.broadcast_to(conditions, (len(xy), SETTINGS))
+        return Memory(np.asarray(xy, np.float64), rows, keys, values)
 
-    def query(self, memory: Memory, xy: NDArray[np.floating], conditions: Conditions) -> FieldAnswer:
+    def query(self, memory: Memory, xy: NDArray[np.floating], conditions: NDArray[np.float64]) -> FieldAnswer:
         """Answer at a place, shape (2,) in half diagonals, x to the right, y upwards, as it is asked for."""
-        place, rows = np.asarray(xy, np.float64)[None], conditions.row()[None]
+        place, rows = np.asarray(xy, np.float64)[None], conditions[None]
         x = np.concatenate([place_features(place), condition_features(rows)], -1)
         x = self._linear("ask.1", _gelu(self._linear("ask.0", x)))
         relation = relation_features(place, rows, memory.xy, memory.settings)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -12,7 +11,8 @@ from scipy import ndimage
 
 from lab.population.sets import adjusted, judge, load_sets
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
-from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork
+from lensmodel.core.types import LensSettings
+from lensmodel.neural import FieldAnswer, FieldNetwork, conditions_of
 from lensmodel.neural.network import WEIGHTS
 from lensmodel.neural.statistics import (
     LENGTH,
@@ -29,7 +29,7 @@ from lensmodel.neural.statistics import (
 )
 
 COLOURS = np.tile(np.array([[0, 1], [1, 2]], np.int8), (WINDOW // 2, WINDOW // 2))
-WIDE_OPEN = Conditions(f_number=2.8, pitch_um=4.5)
+WIDE_OPEN = conditions_of(LensSettings(aperture=2.8), 4.5)
 PHOTOGRAPHS = ("spices", "lake", "city", "colosseum", "tea-gardens")
 PLACES = np.array([(x, y) for x in (-0.7, -0.25, 0.3, 0.75) for y in (-0.4, 0.05, 0.45)])
 
@@ -57,11 +57,11 @@ def photo(blur: float, *, noise: float = 1e-3, seed: int = 0, name: str = "spice
 
 
 def ask(
-    statistics: np.ndarray, xy: np.ndarray, place: tuple[float, float], conditions: Conditions = WIDE_OPEN
+    statistics: np.ndarray, xy: np.ndarray, place: tuple[float, float], conditions: np.ndarray = WIDE_OPEN
 ) -> FieldAnswer:
     network = FieldNetwork.load()
     tokens = network.encode(statistics, xy, WIDE_OPEN)
-    return network.query(network.memory(tokens, xy, [WIDE_OPEN] * len(xy)), np.array(place), conditions)
+    return network.query(network.memory(tokens, xy, WIDE_OPEN), np.array(place), conditions)
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +106,8 @@ def test_a_new_photo_leaves_the_tokens_of_others_as_they_are(sharp: np.ndarray) 
     alone = network.encode(sharp, PLACES, WIDE_OPEN)
     np.testing.assert_array_equal(network.encode(sharp, PLACES, WIDE_OPEN), alone)
     both = np.concatenate([alone, network.encode(photo(0.8, seed=5), PLACES, WIDE_OPEN)])
-    memory = network.memory(both, np.tile(PLACES, (2, 1)), [WIDE_OPEN] * len(both))
-    part = network.memory(alone, PLACES, [WIDE_OPEN] * len(alone))
+    memory = network.memory(both, np.tile(PLACES, (2, 1)), WIDE_OPEN)
+    part = network.memory(alone, PLACES, WIDE_OPEN)
     np.testing.assert_allclose(memory.keys[:, :, : len(alone)], part.keys, atol=1e-5)
 
 
@@ -120,7 +120,7 @@ def test_softer_photos_give_wider_kernels() -> None:
 
 
 def test_a_question_at_another_aperture_uses_these_samples(sharp: np.ndarray) -> None:
-    closed = replace(WIDE_OPEN, f_number=5.6)
+    closed = conditions_of(LensSettings(aperture=5.6), 4.5)
     soft = photo(2.5)
     assert width(ask(soft, PLACES, (0.3, 0.1), closed)) > width(ask(sharp, PLACES, (0.3, 0.1), closed))
 
@@ -147,7 +147,7 @@ def test_told_error_grows_where_samples_are_few_far_or_noisy() -> None:
 
 def test_no_samples_are_refused() -> None:
     with pytest.raises(NoSamplesError, match="calibrate"):
-        FieldNetwork.load().memory(np.empty((0, 192)), np.empty((0, 2)), [])
+        FieldNetwork.load().memory(np.empty((0, 192)), np.empty((0, 2)), WIDE_OPEN)
 
 
 def test_statistics_of_a_wrong_shape_or_not_finite_are_refused(sharp: np.ndarray) -> None:
@@ -166,7 +166,7 @@ def test_scaled_logits_raise_kernels_to_powers(monkeypatch: pytest.MonkeyPatch) 
     scaled = FieldNetwork.from_bytes(adjusted(WEIGHTS.read_bytes(), powers=(1.0, 0.5, 1.0)))
     sharp = photo(1.0)
     before, after = (
-        network.query(network.memory(network.encode(sharp, PLACES, WIDE_OPEN), PLACES, [WIDE_OPEN] * 12),
+        network.query(network.memory(network.encode(sharp, PLACES, WIDE_OPEN), PLACES, WIDE_OPEN),
                       PLACES[0], WIDE_OPEN).kernels
         for network in (plain, scaled)
     )  # fmt: skip

@@ -15,9 +15,9 @@ from lensmodel.core.files import to_json, write_atomically
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.report import (
+    EXPORTERS,
     LensReport,
     compare,
-    exporters,
     filled_aspect,
     lens_report,
     provenance,
@@ -25,7 +25,6 @@ from lensmodel.report import (
     to_csv,
     widest,
 )
-from lensmodel.report import export as write_psfs
 
 Aperture = Annotated[float | None, console.aperture("f-number; default: the widest that a photo had.")]
 
@@ -130,7 +129,7 @@ def export(
     profile: console.ProfileFile,
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", help=f"Where to write: a file that ends in .{', .'.join(exporters)}."),
+        typer.Option("--output", "-o", help=f"Where to write: a file that ends in .{', .'.join(EXPORTERS)}."),
     ],
     aperture: Aperture = None,
     channel: console.Channel = "g",
@@ -154,8 +153,8 @@ def export(
     Exit status: 0 written, 1 the profile cannot be used, 2 wrong usage.
     """
     shown, file_format = Display(), output.suffix.lower().removeprefix(".")
-    if file_format not in exporters:
-        raise UsageError(f"give a name that ends in .{', .'.join(exporters)}, got {output.name}")
+    if file_format not in EXPORTERS:
+        raise UsageError(f"give a name that ends in .{', .'.join(EXPORTERS)}, got {output.name}")
     files.refuse_existing(output, force=force)
     if phi is not None and r is None:
         raise UsageError("--phi needs --r: together they name a single place")
@@ -173,5 +172,5 @@ def export(
             aspect=filled_aspect(model),
             at=place,
         )
-    write_psfs(output, psfs, file_format)
+    write_atomically(output, EXPORTERS[file_format](psfs))
     shown.result(str(output))

@@ -158,13 +158,8 @@ def read_profile(source: Path | str | IO[bytes], name: str) -> LensProfile:
         excluded = chosen.get("excluded", ())  # photos that do not count, of earlier profiles
         samples = unpack_samples(PackedSamples(entries, stack, encoded))
         model = LensModel.fit([s for s in samples if s.photo not in excluded], chosen.get("mode", "default"))
-        cameras = (_texts(camera) for camera in document.get("cameras", []))
-        return LensProfile(
-            model,
-            _texts(document["lens"]),
-            _texts(document["photos"]),
-            tuple(Camera(known.get("maker"), known.get("model"), known.get("serial")) for known in cameras),
-        )
+        cameras = tuple(Camera(**_texts(camera)) for camera in document.get("cameras", []))
+        return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]), cameras)
     except LensModelError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
@@ -223,23 +218,28 @@ def _middle(side: int, size: int) -> tuple[slice, slice]:
     return slice(margin, margin + size), slice(margin, margin + size)
 
 
+def _number(value: float | None) -> float | None:
+    return None if value is None else float(value)
+
+
+# Of a sample, as they stand in its entry, and what makes them of JSON of any kind
+_FIELDS: Final[Mapping[str, Callable[[Any], Any]]] = {
+    "weight": float,
+    "photo": str,
+    "pixel_pitch_um": _number,
+    "half_diagonal_px": _number,
+    "estimator": str,
+    "error": _number,
+}
+
+
 def entry_of(sample: PsfSample) -> dict[str, Any]:
     """Return the named fields of a sample: all of it but the kernel and the encoded patch."""
     settings = asdict(sample.settings)
-    if settings["focus_m"] is not None and math.isinf(settings["focus_m"]):
+    if settings["focus_m"] == math.inf:
         settings["focus_m"] = _INFINITY
-    return {
-        "size": sample.kernel.shape[0],
-        "r": sample.position.r,
-        "phi": sample.position.phi,
-        "settings": settings,
-        "weight": sample.weight,
-        "photo": sample.photo,
-        "pixel_pitch_um": sample.pixel_pitch_um,
-        "half_diagonal_px": sample.half_diagonal_px,
-        "estimator": sample.estimator,
-        "error": sample.error,
-    }
+    named = {name: getattr(sample, name) for name in _FIELDS}
+    return {"size": sample.kernel.shape[0], **asdict(sample.position), "settings": settings, **named}
 
 
 def sample_of(
@@ -249,18 +249,10 @@ def sample_of(
     settings = dict(entry["settings"])
     if settings.get("focus_m") == _INFINITY:
         settings["focus_m"] = math.inf
-    return PsfSample(
-        kernel=np.asarray(kernel, dtype=np.float64),
-        position=FieldPosition(float(entry["r"]), float(entry["phi"])),
-        settings=LensSettings(**settings),
-        weight=float(entry["weight"]),
-        photo=str(entry["photo"]),
-        pixel_pitch_um=entry["pixel_pitch_um"],
-        estimator=str(entry["estimator"]),
-        encoded=encoded,
-        error=entry["error"],
-        half_diagonal_px=entry["half_diagonal_px"],
-    )
+    place = FieldPosition(float(entry["r"]), float(entry["phi"]))
+    named = {name: read(entry[name]) for name, read in _FIELDS.items()}
+    values = np.asarray(kernel, dtype=np.float64)
+    return PsfSample(values, place, LensSettings(**settings), encoded=encoded, **named)
 
 
 # --- which lens it is ----------------------------------------------------------------------------

@@ -4,7 +4,7 @@ Figures are drawn by `lensmodel.report.plots`, which needs matplotlib, and is im
 """
 
 from lensmodel.report.centring import centring
-from lensmodel.report.export import PsfGrid, export, exporters, place_table, psf_grid, to_csv
+from lensmodel.report.export import EXPORTERS, PsfGrid, place_table, psf_grid, to_csv
 from lensmodel.report.lens_report import (
     LensReport,
     Unit,
@@ -18,14 +18,13 @@ from lensmodel.report.lens_report import (
 )
 
 __all__ = [
+    "EXPORTERS",
     "LensReport",
     "PsfGrid",
     "Unit",
     "caution",
     "centring",
     "compare",
-    "export",
-    "exporters",
     "filled_aspect",
     "lens_report",
     "place_table",

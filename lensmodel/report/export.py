@@ -11,17 +11,14 @@ import importlib
 import io
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.files import write_atomically
-from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
 from lensmodel.report.centring import EDGE_R
@@ -149,13 +146,8 @@ def to_json(psfs: PsfGrid) -> bytes:
     return json.dumps(content, allow_nan=False).encode()
 
 
-# Formats by name, each of which turns `psfs` into the bytes of a file; names of files end in it
-exporters: Registry[bytes] = Registry("export format", {"fits": to_fits, "json": to_json, "npz": to_npz})
-
-
-def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
-    """Write a grid in a format; the file appears complete or not at all."""
-    write_atomically(Path(path), exporters.create(file_format, psfs=psfs))
+EXPORTERS: Final[Mapping[str, Callable[[PsfGrid], bytes]]] = {"fits": to_fits, "json": to_json, "npz": to_npz}
+"""What makes a file of PSFs, by the ending of its name."""
 
 
 def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
@@ -177,9 +169,7 @@ def to_csv(report: LensReport) -> str:
     writer = csv.DictWriter(out, _HEAD, restval="", lineterminator="\n")
     writer.writeheader()
     for row in (row for found in report.tested for row in _rows(found)):
-        writer.writerow(
-            {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items() if v is not None}
-        )
+        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
     return out.getvalue()
 
 
@@ -205,14 +195,15 @@ def _rows(found: ApertureReport) -> Iterator[_Row]:
         for direction, values in (("tangential", curve.tangential), ("sagittal", curve.sagittal)):
             for r, value in zip(found.radii, values, strict=True):
                 yield known | own | {"direction": direction, "r": r, "value": value}
-    centring, errors = found.centring, (0.0, -2.0, 2.0)
+    centring = found.centring
     own = {"value": int(centring.verdict == "decentred"), "unknown": int(centring.verdict == "unknown")}
     yield known | {"quantity": "decentred"} | own
-    if (softer := centring.softer) is not None:
-        own = {"quantity": "width of blur, softer side over opposite side", "unit": "ratio", "r": EDGE_R}
-        value, low, high = (math.exp(softer.amount + k * softer.error) for k in errors)
-        yield known | own | {"phi": softer.direction, "value": value, "low": low, "high": high}
-    if (coma := centring.coma) is not None:
-        own = {"quantity": "coma in the middle of the picture", "unit": "cubed widths of blur", "r": 0.0}
-        value, low, high = (max(coma.amount + k * coma.error, 0.0) for k in errors)
-        yield known | own | {"phi": coma.direction, "value": value, "low": low, "high": high}
+    for sign, quantity, unit, r in (
+        (centring.softer, "width of blur, softer side over opposite side", "ratio", EDGE_R),
+        (centring.coma, "coma in the middle of the picture", "cubed widths of blur", 0.0),
+    ):
+        if sign is not None:
+            ends = (sign.amount + k * sign.error for k in (0.0, -2.0, 2.0))
+            value, low, high = (math.exp(end) if unit == "ratio" else max(end, 0.0) for end in ends)
+            own = {"quantity": quantity, "unit": unit, "r": r, "phi": sign.direction}
+            yield known | own | {"value": value, "low": low, "high": high}

@@ -29,7 +29,6 @@ K. P. Thompson, JOSA A 22, 2005.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import lru_cache
@@ -111,12 +110,10 @@ class SimulatedLens:
         first, last = self.focal_mm[0], self.focal_mm[-1]
         if not first * 0.999 <= focal_mm <= last * 1.001:
             raise InvalidInputError(f"the lens covers {first:g} to {last:g} mm, got {focal_mm:g}")
-        upper = bisect_right(self.focal_mm, focal_mm)
-        if upper in {0, len(self.focal_mm)}:
-            return self.optics[0 if upper == 0 else -1]
-        a, b = self.focal_mm[upper - 1], self.focal_mm[upper]
-        share = math.log(focal_mm / a) / math.log(b / a)
-        return self.optics[upper - 1].mixed(self.optics[upper], share)
+        places = np.arange(len(self.focal_mm))
+        share, below = math.modf(np.interp(math.log(focal_mm), np.log(self.focal_mm), places))
+        lower = self.optics[int(below)]
+        return lower.mixed(self.optics[int(below) + 1], share) if share else lower
 
     def widest(self, focal_mm: float | None = None) -> float:
         """Widest aperture at a focal length; None means the shortest."""
@@ -316,10 +313,9 @@ class Aberrations:
 
     def mixed(self, other: Aberrations, share: float) -> Aberrations:
         """Optics between two focal lengths: every term linear in `share` of `other`."""
-        values: list[Any] = []
-        for a, b in zip(astuple(self), astuple(other), strict=True):
-            mixed = (np.asarray(a) + share * np.subtract(b, a)).tolist()
-            values.append(tuple(mixed) if isinstance(mixed, list) else mixed)
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        mixed = [(np.asarray(a) + share * np.subtract(b, a)).tolist() for a, b in pairs]
+        values: list[Any] = [tuple(value) if isinstance(value, list) else value for value in mixed]
         return Aberrations(*values)
 
 
@@ -426,51 +422,43 @@ _USUAL: Final = {
 }
 """Proportions of the aberrations of a lens; uniform faults and tilt as shares of the corner's blur."""
 
-# Of each kind: its f-numbers, and the r.m.s. widths of the ray spot at the centre and at r = 1 (mean
-# over phi) in pixels of 4.5 um, from and to.
-_BLUR: Final[Mapping[str, tuple[Sequence[float], _Range, _Range]]] = {
-    "soft-fast": ((1.4, 1.6, 1.8), (0.9, 1.4), (2.2, 4.2)),
-    "coma": ((1.8, 2.0, 2.4), (0.3, 0.7), (1.3, 3.0)),
-    "astigmatism": ((2.0, 2.4, 2.8), (0.3, 0.7), (1.2, 3.0)),
-    "field-curvature": ((1.8, 2.0, 2.8), (0.3, 0.7), (1.2, 3.0)),
-    "decentred": ((1.8, 2.0, 2.8), (0.4, 0.8), (1.2, 2.6)),
-    "tilted": ((1.8, 2.0, 2.8), (0.3, 0.7), (1.0, 2.2)),
-    "nearly-perfect": ((2.8, 3.5, 4.0), (0.1, 0.25), (0.5, 0.8)),
-    "zoom": ((2.8, 3.5, 4.0), (0.4, 0.9), (1.2, 3.0)),
-}
-# And what is not as usual: a number, or from and to.
-_UNUSUAL: Final[Mapping[str, Mapping[str, float | _Range]]] = {
-    "soft-fast": {"coma": 1.5},
-    "coma": {"coma": 3.0, "astigmatism": 0.4, "field_curvature": 0.3},
-    "astigmatism": {"coma": 0.4, "astigmatism": 3.0, "field_curvature": 0.2},
-    "field-curvature": {"coma": 0.4, "astigmatism": 0.3, "field_curvature": 3.0},
-    "decentred": {"decentring": (0.2, 0.4), "uniform_coma": (0.15, 0.3)},
-    "tilted": {"tilt": (0.4, 0.7), "uniform_astigmatism": (0.05, 0.15)},
-    "nearly-perfect": {"tilt": 0.1},
-    "zoom": {"decentring": 0.12},
+_FAST: Final = (1.8, 2.0, 2.8)
+_SHARP: Final = (0.3, 0.7)
+# Of each kind: its f-numbers; the r.m.s. widths of the ray spot at the centre and at r = 1 (mean over phi) in
+# pixels of 4.5 um, from and to; and what is not as usual, a number, or from and to.
+_KINDS: Final[Mapping[str, tuple[Sequence[float], _Range, _Range, Mapping[str, float | _Range]]]] = {
+    "soft-fast": ((1.4, 1.6, 1.8), (0.9, 1.4), (2.2, 4.2), {"coma": 1.5}),
+    "coma": ((1.8, 2.0, 2.4), _SHARP, (1.3, 3.0), {"coma": 3.0, "astigmatism": 0.4, "field_curvature": 0.3}),
+    "astigmatism": (
+        *((2.0, 2.4, 2.8), _SHARP, (1.2, 3.0)),
+        {"coma": 0.4, "astigmatism": 3.0, "field_curvature": 0.2},
+    ),
+    "field-curvature": (_FAST, _SHARP, (1.2, 3.0), {"coma": 0.4, "astigmatism": 0.3, "field_curvature": 3.0}),
+    "decentred": (_FAST, (0.4, 0.8), (1.2, 2.6), {"decentring": (0.2, 0.4), "uniform_coma": (0.15, 0.3)}),
+    "tilted": (_FAST, _SHARP, (1.0, 2.2), {"tilt": (0.4, 0.7), "uniform_astigmatism": (0.05, 0.15)}),
+    "nearly-perfect": ((2.8, 3.5, 4.0), (0.1, 0.25), (0.5, 0.8), {"tilt": 0.1}),
+    "zoom": ((2.8, 3.5, 4.0), (0.4, 0.9), (1.2, 3.0), {"decentring": 0.12}),
 }
 _PRIME_MM: Final = (24.0, 35.0, 50.0, 85.0)
 _ZOOM_MM: Final = ((18.0, 24.0, 28.0), (70.0, 85.0, 105.0))
 
-LENS_KINDS: Final = tuple(_BLUR)  # kinds of lenses that `draw_lens` knows
+LENS_KINDS: Final = tuple(_KINDS)  # kinds of lenses that `draw_lens` knows
 
 
 def draw_lens(seed: int, kind: str | None = None) -> SimulatedLens:
     """Draw a copy of a lens, whose ray spot has a drawn r.m.s. width at the centre and one in the corner."""
     kind = LENS_KINDS[seed % len(LENS_KINDS)] if kind is None else kind
-    if kind not in _BLUR:
+    if kind not in _KINDS:
         raise UnknownMethodError(f"no kind of lens {kind!r}; known: {', '.join(LENS_KINDS)}")
     rng = np.random.default_rng([seed, LENS_KINDS.index(kind)])
-    f_numbers, *widths = _BLUR[kind]
+    f_numbers, *widths, unusual = _KINDS[kind]
     choices = _ZOOM_MM if kind == "zoom" else (_PRIME_MM,)
     focals = tuple(float(rng.choice(several)) for several in choices)
     f_number = float(rng.choice(f_numbers))
     center, corner = (float(rng.uniform(*ends)) for ends in widths)
-    drawn = {
-        name: float(rng.uniform(*value)) if isinstance(value, tuple) else value
-        for name, value in _UNUSUAL[kind].items()
-    }
-    proportions = {**_USUAL, **drawn}
+    proportions = dict(_USUAL)
+    for name, value in unusual.items():
+        proportions[name] = float(rng.uniform(*value)) if isinstance(value, tuple) else value
     optics = [_optics(proportions, f_number, center, corner, rng)]
     if kind == "zoom":
         corner *= float(rng.uniform(0.6, 1.1))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import io
 import json
 import math
 import sys
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, centroid
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
-from lensmodel.report import PsfGrid, export, psf_grid
+from lensmodel.report import EXPORTERS, PsfGrid, psf_grid
 from lensmodel.simulate import draw_lens
 
 SETTINGS = LensSettings(aperture=2.0)
@@ -48,11 +48,9 @@ def test_a_grid_asks_the_model_at_each_place(model: LensModel, psfs: PsfGrid) ->
         assert kernel == pytest.approx(model.query(FieldPosition(r, phi), SETTINGS, 15).kernel, abs=1e-7)
 
 
-def test_fits_is_a_cube_stored_from_the_bottom_with_a_table_of_places(psfs: PsfGrid, tmp_path: Path) -> None:
+def test_fits_is_a_cube_stored_from_the_bottom_with_a_table_of_places(psfs: PsfGrid) -> None:
     fits = importlib.import_module("astropy.io.fits")
-    export(tmp_path / "psf.fits", psfs, "fits")
-
-    with fits.open(tmp_path / "psf.fits") as file:
+    with fits.open(io.BytesIO(EXPORTERS["fits"](psfs))) as file:
         cube, header = file[0].data, file[0].header
         table = file["POSITIONS"].data
         assert np.array_equal(cube[:, ::-1], psfs.kernels)
@@ -65,33 +63,27 @@ def test_fits_is_a_cube_stored_from_the_bottom_with_a_table_of_places(psfs: PsfG
 
 @pytest.mark.parametrize("form", ["fits", "json"])
 def test_a_single_place_is_a_bare_matrix_with_the_top_row_last_in_fits_and_first_in_json(
-    form: Literal["fits", "json"], tmp_path: Path
+    form: Literal["fits", "json"],
 ) -> None:
-    path = tmp_path / "one"
-    export(path, arrow(), form)
+    written = EXPORTERS[form](arrow())
 
     if form == "fits":
-        stored = importlib.import_module("astropy.io.fits").getdata(path)[::-1]
+        stored = importlib.import_module("astropy.io.fits").getdata(io.BytesIO(written))[::-1]
     else:
-        stored = np.array(json.loads(path.read_text(encoding="utf-8")))
+        stored = np.array(json.loads(written))
     assert stored.shape == (5, 5)
     assert (stored[0, 2], stored[2, 4]) == (0.75, 0.25)
 
 
-def test_fits_without_astropy_names_the_remedy(
-    psfs: PsfGrid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fits_without_astropy_names_the_remedy(psfs: PsfGrid, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "astropy.io.fits", None)
 
     with pytest.raises(InvalidInputError, match=r"pip install '\.\[fits\]'"):
-        export(tmp_path / "psf.fits", psfs, "fits")
-    assert list(tmp_path.iterdir()) == []
+        EXPORTERS["fits"](psfs)
 
 
-def test_npz_holds_kernels_and_places_without_pickle(psfs: PsfGrid, tmp_path: Path) -> None:
-    export(tmp_path / "psf.npz", psfs, "npz")
-
-    with np.load(tmp_path / "psf.npz", allow_pickle=False) as stored:
+def test_npz_holds_kernels_and_places_without_pickle(psfs: PsfGrid) -> None:
+    with np.load(io.BytesIO(EXPORTERS["npz"](psfs)), allow_pickle=False) as stored:
         assert np.array_equal(stored["psf"], psfs.kernels)
         assert stored["r"].tolist() == psfs.r.tolist()
         assert stored["phi"].tolist() == psfs.phi.tolist()
@@ -99,10 +91,8 @@ def test_npz_holds_kernels_and_places_without_pickle(psfs: PsfGrid, tmp_path: Pa
         assert set(stored["aperture"]) == {2.0}
 
 
-def test_json_of_a_grid_holds_every_kernel_to_the_last_bit(psfs: PsfGrid, tmp_path: Path) -> None:
-    export(tmp_path / "psf.json", psfs, "json")
-
-    stored = json.loads((tmp_path / "psf.json").read_text(encoding="utf-8"))
+def test_json_of_a_grid_holds_every_kernel_to_the_last_bit(psfs: PsfGrid) -> None:
+    stored = json.loads(EXPORTERS["json"](psfs))
     kernels = np.array([entry["kernel"] for entry in stored["psfs"]], dtype=np.float32)
     assert np.array_equal(kernels, psfs.kernels)
     assert (stored["rows"], stored["cols"], stored["aperture"]) == (2, 3, 2.0)

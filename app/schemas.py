@@ -426,9 +426,7 @@ class Support(Model):
     extrapolated: bool
     beyond: list[str] = Field([], description="in which variables it lies outside the samples")
     predicted_error: float | None
-    answered_by: str = Field(description="network, regression, or network and regression")
-    weights: str = Field("", description="fingerprint of the network's weights")
-    nearest: float = Field(0.0, description="distance to the nearest sample: 1 is a stop, or a fifth of r")
+    weights: str = Field("", description="fingerprint of the network's weights, empty where none took part")
 
 
 class Units(Model):

@@ -16,7 +16,7 @@ from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone, zone_of
 from lensmodel.model import camera_bodies
 from lensmodel.model.learned_field import LearnedField
-from lensmodel.model.query import MODES, PAPER, VARIABLES, AnsweredBy, PsfAnswer
+from lensmodel.model.query import MODES, PAPER, VARIABLES, PsfAnswer
 from lensmodel.model.regression import Regression
 
 _LEAST_ERROR: Final = 0.01  # relative L2 below which no part of an answer is believed (chosen)
@@ -92,11 +92,9 @@ class LensModel:
             predicted_error=min(float(precision.sum() ** -0.5), 1.0),
             effective_samples=1.0 / float(weights @ weights),
             photos=int(np.count_nonzero(np.bincount(number, weights, len(names)) > _LISTED)),
-            nearest=min(part.support.nearest for part in parts),
             beyond=tuple(name for name in VARIABLES if name in beyond),
-            answered_by=self._answered_by,
             weights=self.weights,
-            ring_error=parts[0].ring_error,
+            ring_error=parts[0].ring_error if len(parts) == 1 else None,
         )
 
     def kernels(
@@ -131,14 +129,6 @@ class LensModel:
     def weights(self) -> str:
         """Fingerprint of the weights of the network; empty where none takes part."""
         return "" if self._attention is None else self._attention.network.name
-
-    @property
-    def _answered_by(self) -> AnsweredBy:
-        if self.mode == PAPER:
-            return "paper"
-        if self._regression is None:
-            return "network"
-        return "regression" if self._attention is None else "network and regression"
 
     @cached_property
     def pitch_um(self) -> float | None:

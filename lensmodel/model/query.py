@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,9 +116,6 @@ class Support:
 PAPER: Final = "paper"
 MODES: Final = ("default", PAPER)  # ways to answer from samples, see `LensModel`
 
-AnsweredBy: TypeAlias = Literal["network", "regression", "network and regression", "paper"]
-"""What made an answer."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PsfAnswer:
@@ -134,25 +131,19 @@ class PsfAnswer:
         1 / sum W^2 of the samples' weights W in the answer, of sum 1.
     photos : int
         Photos of these samples.
-    nearest : float
-        Distance to the nearest sample, see `lensmodel.model.query.Support`.
     beyond : tuple of str
         Variables in which the question lies far from all samples.
-    answered_by : {"network", "regression", "network and regression", "paper"}
-        What made the answer.
     weights : str
         Fingerprint of the network's weights; empty where no network took part.
     ring_error : ndarray of float64, shape (8,), or None
-        Expected r.m.s. error of the transfer function in rings of frequency; None where no network took part.
+        Expected r.m.s. error of the transfer function in rings of frequency; None but of the network alone.
     """
 
     kernel: Kernel
     predicted_error: float
     effective_samples: float
     photos: int
-    nearest: float
     beyond: tuple[str, ...]
-    answered_by: AnsweredBy
     weights: str = ""
     ring_error: NDArray[np.float64] | None = None
 

@@ -246,8 +246,6 @@ class FieldNetwork:
             raise InvalidInputError(
                 f"statistics must be (n, {LENGTH}) and places (n, 2), got {statistics.shape} and {xy.shape}"
             )
-        if not (np.isfinite(statistics).all() and np.isfinite(xy).all()):
-            raise InvalidInputError("statistics and places must be finite; leave patches out that are not")
         rows = np.broadcast_to(conditions, (len(xy), SETTINGS))
         x = np.clip((statistics - self.weights["mean"]) / self.weights["spread"], -_CLAMP, _CLAMP)
         x = np.concatenate([x, condition_features(rows), place_features(xy)], -1)

@@ -240,12 +240,8 @@ def _order(octant: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     found = direction_order(octant)[:_HALF]
     place, sign = found % _HALF, np.where(found < _HALF, 1.0, -1.0)
     index, signs = np.arange(LENGTH), np.ones(LENGTH, np.float32)
-    for name, size in _SIZES.items():
-        if name == "level":
-            continue
-        part = group(name)
-        rows = size // _HALF
-        index[part] = (part.start + np.arange(rows)[:, None] * _HALF + place).ravel()
-        if name.endswith("_odd"):
-            signs[part] = np.tile(sign, rows)
+    turned = group("level").start
+    index[:turned] = (np.arange(0, turned, _HALF)[:, None] + place).ravel()
+    for name in ("cubed_odd", "seventh_odd"):
+        signs[group(name)] = np.tile(sign, len(_SHIFTS))
     return index, signs

@@ -394,7 +394,7 @@ def _mtf50(answer: PsfAnswer, angle: float, measured: bool) -> tuple[float, Rang
     Neither goes beyond the Nyquist frequency, which then means "at least".
     """
     value = mtf50_from_kernel(answer.kernel, angle)
-    if answer.ring_error is None or answer.answered_by != "network":
+    if answer.ring_error is None:
         # between and beyond the places of a chart less is known than at them
         share = max(answer.predicted_error, _MEASURED if measured else 0.0)
         low, high = max(value * (1.0 - share), 0.0), value * (1.0 + share)

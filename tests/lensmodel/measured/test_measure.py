@@ -417,7 +417,9 @@ def test_squares_give_red_its_own_kernel_where_demosaicing_gave_it_the_sharpness
 
 def test_measured_samples_join_blind_ones() -> None:
     (old,), new = (
-        Sure(0.04).measure([grey_photo()], size=11, channels=("g",), settings=LensSettings(2.0), photo_id=name)
+        Sure(0.04).measure(
+            [grey_photo()], size=11, channels=("g",), settings=LensSettings(2.0), photo_id=name
+        )
         for name in ("old", "new")
     )
     assert new[0].estimator == "measured-sure/1"

@@ -41,7 +41,9 @@ class Judged(NamedTuple):
 
 def judged(path: Path, settings: LensSettings) -> Iterator[Judged]:
     """Measure the stars of a photo, learn its lens from it blindly, and compare cell by cell."""
-    stars = Points().measure([develop(path)], size=SIZE, channels=("g",))
+    photo = develop(path)
+    said = photo.info.metadata.settings(settings)
+    stars = Points().measure([photo], size=SIZE, channels=("g",), settings=said)
     samples = sampling.samples_of_photo(path, sampling.configured("default", settings), workers=1)
     model, green = LensModel.fit(samples), settings.with_channel("g")
     widths = [rms_width(star.kernel) for star in stars]

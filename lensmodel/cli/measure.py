@@ -62,7 +62,7 @@ def measure(
     paths = files.photos(photos, shown.note)
     files.refuse_photo(profile, paths)
     with files.as_usage():
-        groups = measuring.measurements_of(kind, paths)
+        method, groups = measuring.methods.create(kind), measuring.measurements_of(kind, paths)
         store = files.ProfileFile(profile)
         config = configured(store.model, LensSettings(aperture=aperture))
         calibration = Calibration(store, config, any_lens=any_lens)
@@ -70,16 +70,10 @@ def measure(
     with shown.progress(total=len(groups)) as bar:
         for number, group in enumerate(groups):
             bar.show(description=f"{group[0].name}: measuring")
-            sampler = partial(
-                measuring.samples_of_developed,
-                kind,
-                settings=config.settings,
-                size=size,
-                on_step=partial(bar.part, number),
-            )
+            sampler = partial(method.measure, size=size, on_step=partial(bar.part, number))
             result: dict[str, Any]
             try:
-                result = _added(calibration, group, sampler)
+                result = _added(calibration, group, config.settings, sampler)
             except (LensModelError, OSError) as error:
                 result = files.failed(error)
                 shown.error(f"{group[0]}: {result['reason']}")
@@ -98,14 +92,15 @@ def measure(
 
 
 def _added(
-    calibration: Calibration, group: Sequence[Path], sampler: partial[list[PsfSample]]
+    calibration: Calibration, group: Sequence[Path], given: LensSettings, sampler: partial[list[PsfSample]]
 ) -> dict[str, Any]:
     """Measure on the photos of one measurement and add to the lens; say what became of it."""
     samples: list[PsfSample] = []
 
     def measured(key: str, admit: Admit) -> list[PsfSample]:
         first = develop(group[0], on_info=lambda info: admit(info.metadata))
-        samples.extend(sampler([first, *map(develop, group[1:])], photo_id=key))
+        settings = first.info.metadata.settings(given)
+        samples.extend(sampler([first, *map(develop, group[1:])], settings=settings, photo_id=key))
         return samples
 
     if calibration.add(group[0], measured) is None:

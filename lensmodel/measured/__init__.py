@@ -7,50 +7,19 @@ from pathlib import Path
 from typing import Final
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import PsfSample
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.measured.edges import SlantedEdges
 from lensmodel.measured.measurer import Measurer
 from lensmodel.measured.pair import AperturePair
 from lensmodel.measured.points import Points
 from lensmodel.measured.target import DETAILS, PAPERS, Target, TargetPage, print_target
-from lensmodel.photo import LinearPhoto, inspect
+from lensmodel.photo import inspect
 
 methods: Final[Registry[Measurer]] = Registry(
     "way of measuring", {"target": Target, "pair": AperturePair, "points": Points, "edges": SlantedEdges}
 )
 
-__all__ = [
-    "DETAILS",
-    "PAPERS",
-    "Measurer",
-    "TargetPage",
-    "measurements_of",
-    "methods",
-    "print_target",
-    "samples_of_developed",
-]
-
-
-def samples_of_developed(
-    kind: str,
-    photos: Sequence[LinearPhoto],
-    *,
-    photo_id: str,
-    settings: LensSettings | None = None,
-    size: int = 31,
-    on_step: StepHook = ignore_step,
-) -> list[PsfSample]:
-    """Measure the PSF on one photo, or on the two of an aperture pair, the open one first."""
-    method = methods.create(kind)
-    if not photos:
-        raise InvalidInputError(f"measuring by {kind} needs photos, none was given")
-    metadata = photos[0].info.metadata
-    photos[0].info.require_known_turn()
-    metadata.require_aperture(settings)
-    said = metadata.settings(settings)
-    return method.measure(photos, size=size, settings=said, photo_id=photo_id, on_step=on_step)
+__all__ = ["DETAILS", "PAPERS", "Measurer", "TargetPage", "measurements_of", "methods", "print_target"]
 
 
 def measurements_of(kind: str, paths: Sequence[Path]) -> list[tuple[Path, ...]]:

@@ -83,7 +83,7 @@ class Measurer(ABC):
         self,
         photos: Sequence[LinearPhoto],
         *,
-        size: int,
+        size: int = 31,
         channels: Sequence[Channel] = CHANNELS,
         settings: LensSettings | None = None,
         photo_id: str = "",
@@ -91,9 +91,10 @@ class Measurer(ABC):
     ) -> list[PsfSample]:
         """Measure the PSF wherever the photos, as many as `photos` says, show it: samples for a `LensModel`.
 
-        The first is the one whose PSF is measured, at `settings`, else those that it says itself; kernels
-        have an odd side of `size` pixels. The estimator is called `measured-NAME/VERSION`. `on_step` is
-        called after each place, and now and then before the first one, with nothing done of 1.
+        The first, wide open where there are two, is the one whose PSF is measured, at `settings`, else those
+        that it says itself; kernels have an odd side of `size` pixels. The estimator is called
+        `measured-NAME/VERSION`. `on_step` is called after each place, and now and then before the first one,
+        with nothing done of 1.
         """
         if len(photos) != self.photos:
             raise InvalidInputError(
@@ -104,6 +105,8 @@ class Measurer(ABC):
             raise InvalidInputError(f"kernels have an odd side of 3 pixels or more, got {size}")
         first, samples = photos[0], list[PsfSample]()
         settings = settings or first.info.metadata.settings()
+        first.info.metadata.require_aperture(settings)
+        first.info.require_known_turn()
         places, psf_in = self._prepare(photos, size, on_step)
         for done, place in enumerate(places, start=1):
             for channel in channels:

@@ -68,7 +68,7 @@ def test_a_measurement_and_its_report_count_the_same_places(
         ]
 
     write_photo(tmp_path / "stars.dng", 1, shape=SMALL)
-    monkeypatch.setattr("lensmodel.measured.samples_of_developed", measure)
+    monkeypatch.setattr("lensmodel.measured.points.Points.measure", measure)
     done = lensmodel("measure", "points", "stars.dng", "--profile", "a.lensprofile", cwd=tmp_path)
     report = lensmodel("report", "a.lensprofile", cwd=tmp_path)
 

@@ -430,4 +430,4 @@ def test_measured_samples_join_blind_ones() -> None:
 
 def test_a_measurement_needs_an_aperture() -> None:
     with pytest.raises(Exception, match="aperture"):
-        measure.samples_of_developed("target", [grey_photo(aperture=None)], photo_id="x")
+        Target().measure([grey_photo(aperture=None)])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import multiprocessing
 import os
 import signal
@@ -273,10 +272,6 @@ AnyLens = Annotated[
     bool, typer.Option("--any-lens", help="Also accept photos that seem to be of a different lens.")
 ]
 Channel = Annotated[types.Channel, typer.Option(help="Colour channel.")]
-RADIUS = typer.Option("--r", min=0.0, max=1.0, help="Distance from the centre: 0 centre, 1 corner.")
-ANGLE = typer.Option(
-    "--phi", min=-math.tau, max=math.tau, help="Angle in radians, counter-clockwise from the right."
-)
 Size = Annotated[int, typer.Option(min=3, max=255, callback=odd, help="Side in pixels, an odd number.")]
 Workers = Annotated[int | None, typer.Option("--workers", "-j", min=1, help="Cores to use; default: all.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]

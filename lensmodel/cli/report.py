@@ -13,7 +13,7 @@ from lensmodel.cli import console, files
 from lensmodel.cli.console import Display, UsageError
 from lensmodel.core.files import to_json, write_atomically
 from lensmodel.core.names import camera_name, full_name
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.types import LensSettings
 from lensmodel.report import (
     EXPORTERS,
     LensReport,
@@ -135,20 +135,18 @@ def export(
     channel: console.Channel = "g",
     rows: Annotated[int, typer.Option(min=1, max=100, help="Rows of the grid of places.")] = 5,
     cols: Annotated[int, typer.Option(min=1, max=100, help="Columns of the grid of places.")] = 7,
-    r: Annotated[float | None, console.RADIUS] = None,
-    phi: Annotated[float | None, console.ANGLE] = None,
     size: console.Size = 31,
     force: console.Force = False,
 ) -> None:
     """Write PSFs for other programs.
 
-    They are a grid over the picture, or a single place with --r and --phi.
+    They are a grid over the picture, with --rows 1 --cols 1 that of its middle.
 
     Examples:
 
         lensmodel export my-24mm.lensprofile -o my-24mm.npz
 
-        lensmodel export my-24mm.lensprofile --aperture 2 --r 0.9 --phi 0.6 -o corner-for-art.json
+        lensmodel export my-24mm.lensprofile --aperture 2 --rows 1 --cols 1 -o for-art.json
 
     Exit status: 0 written, 1 the profile cannot be used, 2 wrong usage.
     """
@@ -156,9 +154,6 @@ def export(
     if file_format not in EXPORTERS:
         raise UsageError(f"give a name that ends in .{', .'.join(EXPORTERS)}, got {output.name}")
     files.refuse_existing(output, force=force)
-    if phi is not None and r is None:
-        raise UsageError("--phi needs --r: together they name a single place")
-    place = None if r is None else FieldPosition(r, phi or 0.0)
     with shown.progress("computing its PSFs"):
         model = files.profile_at(profile).model
         with files.as_usage():
@@ -170,7 +165,6 @@ def export(
             cols=cols,
             size=size,
             aspect=filled_aspect(model),
-            at=place,
         )
     write_atomically(output, EXPORTERS[file_format](psfs))
     shown.result(str(output))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.types import LensSettings
 from lensmodel.model import LensModel
 from lensmodel.report.centring import EDGE_R
 from lensmodel.report.lens_report import DEFAULT_ASPECT, UNIT_NAMES, ApertureReport, LensReport, Spot, grid
@@ -34,7 +34,7 @@ _MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the mem
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PsfGrid:
-    """Kernels at n = rows * cols places, row by row from the top left, or at a single one."""
+    """Kernels at n = rows * cols places, row by row from the top left."""
 
     kernels: NDArray[np.float32]  # (n, k, k)
     r: NDArray[np.float64]  # (n,), half-diagonals
@@ -53,17 +53,14 @@ def psf_grid(
     cols: int = 7,
     size: int = 31,
     aspect: float = DEFAULT_ASPECT,
-    at: FieldPosition | None = None,
 ) -> PsfGrid:
-    """Ask a model for the kernels of a grid of places, or of the place that is given."""
-    if at is not None:
-        rows = cols = 1
+    """Ask a model for the kernels of a grid of places."""
     if size < 1 or 4 * rows * cols * size * size > _MOST_BYTES:
         raise InvalidInputError(
             f"{rows} x {cols} kernels of side {size} are out of range; "
             f"ask for at most {_MOST_BYTES >> 20} MiB"
         )
-    places = grid(rows, cols, aspect) if at is None else (at,)
+    places = grid(rows, cols, aspect)
     answers = [model.query(place, settings, size) for place in places]
     return PsfGrid(
         kernels=np.array([answer.kernel for answer in answers], dtype=np.float32),

@@ -93,7 +93,7 @@ NOT_RUN = {
 
 QUICK = {
     "correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json",
-    "export my-24mm.lensprofile --aperture 2 --r 0.9 --phi 0.6 -o corner-for-art.json",
+    "export my-24mm.lensprofile --aperture 2 --rows 1 --cols 1 -o for-art.json",
     "config",
     "doctor --deep --json",
     "backup my-backup",

@@ -335,7 +335,6 @@ REFUSED = {
     "noise in words": (("bench", "blind", "--noise", "much"), 2, "such as 0.01,0.003, got 'much'"),
     "part to time": (("bench", "correct", "--roi", "1,2,x,4"), 2, "whole numbers T,L,H,W, got '1,2,x,4'"),
     "export by no format": (("export", PROFILE, "-o", "new.bmp"), 2, "ends in .fits, .json"),
-    "half a place": (("export", PROFILE, "-o", "new.npz", "--phi", "1"), 2, "--phi needs --r"),
     "finished benchmark": (("bench", "blind", "-o", "out"), 2, "blind.md is there already; --force replaces"),
     "profile and auto": ((*CORRECT, "--lens", "auto", "-p", PROFILE), 2, "one of them"),
     "neither profile nor auto": (CORRECT, 2, "--lens auto"),

@@ -1,13 +1,6 @@
 """Synthetic lenses, cameras and scenes whose truth is known."""
 
-from lensmodel.simulate.camera import (
-    BlurOptions,
-    SimulatedCamera,
-    SimulatedPhoto,
-    blurred,
-    photograph,
-    write_photo,
-)
+from lensmodel.simulate.camera import SimulatedCamera, SimulatedPhoto, blurred, photograph, write_photo
 from lensmodel.simulate.lens import (
     LENS_KINDS,
     Aberrations,
@@ -29,7 +22,6 @@ __all__ = [
     "DEMO_SCENES",
     "LENS_KINDS",
     "Aberrations",
-    "BlurOptions",
     "CameraLens",
     "SimulatedCamera",
     "SimulatedField",

@@ -6,7 +6,7 @@ Independent of `lensmodel.correction` on purpose: what is tested against it must
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -21,6 +21,8 @@ from lensmodel.core.types import CHANNELS, Channel, Frame, LensSettings, NoiseMo
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.photo.writing import BAYER_PATTERNS, XYZ_TO_SRGB, write_bayer_dng
 from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, CameraLens
+
+DEFAULT_STEP: Final = 0.1  # half diagonals from one node with an exact kernel to the next
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,14 +113,14 @@ def photograph(
     rng: np.random.Generator | None,
     *,
     exposure: float = 1.0,
-    options: BlurOptions | None = None,
+    size: int = DEFAULT_SIZE,
+    step: float = DEFAULT_STEP,
 ) -> SimulatedPhoto:
     """Take a photo: blur (`blurred`), exposure, colour response, noise, clipping, mosaic."""
     if not (math.isfinite(exposure) and exposure > 0.0):
         raise InvalidInputError(f"exposure must be positive, got {exposure}")
-    options = replace(options or BlurOptions(), pitch_um=camera.pitch_um)
     frame = camera.frame
-    clean = blurred(scene, lens, settings, frame, options)
+    clean = blurred(scene, lens, settings, frame, pitch_um=camera.pitch_um, size=size, step=step)
     clean = camera.balanced(clean * np.float32(exposure))
     sharp = _with_margin(scene, frame, 0)
     return SimulatedPhoto(
@@ -134,21 +136,15 @@ def photograph(
 _REFINED: Final = 2  # nodes of the windows per exact node
 
 
-@dataclass(frozen=True, slots=True)
-class BlurOptions:
-    """How the blur of a scene is simulated."""
-
-    pitch_um: float = DEFAULT_PITCH_UM  # pixel pitch in micrometres
-    size: int = DEFAULT_SIZE  # odd side of the kernels in pixels
-    step: float = 0.1  # distance in half diagonals of the nodes where kernels are exact
-
-    def __post_init__(self) -> None:
-        if not 0.01 <= self.step <= 0.5:
-            raise InvalidInputError(f"step must lie in 0.01..0.5 half diagonals, got {self.step}")
-
-
 def blurred(
-    scene: Planes, lens: CameraLens, settings: LensSettings, frame: Frame, options: BlurOptions | None = None
+    scene: Planes,
+    lens: CameraLens,
+    settings: LensSettings,
+    frame: Frame,
+    *,
+    pitch_um: float = DEFAULT_PITCH_UM,
+    size: int = DEFAULT_SIZE,
+    step: float = DEFAULT_STEP,
 ) -> Planes:
     """Blur a scene `(3, H + 2 m, W + 2 m)` as the lens does: every point becomes the kernel of its place.
 
@@ -156,14 +152,16 @@ def blurred(
 
         y = sum_i  k_i * (w_i x)          sum_i w_i = 1,  w_i a triangle in row and column
 
-    They are exact on every second node; those between are cubic splines through them (of a relative L2 error
-    of 0.5 to 1.5 percent). Where m is narrower than half a kernel, the scene is mirrored. Source: M. Hirsch
-    et al., "Efficient filter flow for space-variant multiframe blind deconvolution", CVPR 2010, eq. 2.
+    They are exact on every second node, `step` half diagonals apart; those between are cubic splines through
+    them (of a relative L2 error of 0.5 to 1.5 percent). Kernels have the odd side `size`; where m is narrower
+    than half of it, the scene is mirrored. Source: M. Hirsch et al., "Efficient filter flow for space-variant
+    multiframe blind deconvolution", CVPR 2010, eq. 2.
     """
-    options = options or BlurOptions()
-    half = options.size // 2
+    if not 0.01 <= step <= 0.5:
+        raise InvalidInputError(f"step must lie in 0.01..0.5 half diagonals, got {step}")
+    half = size // 2
     padded = _with_margin(scene, frame, half)
-    spacing = max(round(options.step * frame.half_diagonal / _REFINED), 4)
+    spacing = max(round(step * frame.half_diagonal / _REFINED), 4)
     rows, cols = (_nodes(length, spacing) for length in padded.shape[1:])
     middle = (padded.shape[1] - 1) / 2.0, (padded.shape[2] - 1) / 2.0
     hats = [
@@ -176,7 +174,7 @@ def blurred(
         # field vectors (right, up) of nodes; beyond the frame they are longer than 1
         right, up = (cols - middle[1]) / frame.half_diagonal, (middle[0] - rows) / frame.half_diagonal
         exact = [
-            [_kernel(lens, own, (float(x), float(y)), frame, options) for x in right[::_REFINED]]
+            [_kernel(lens, own, (float(x), float(y)), frame, pitch_um, size) for x in right[::_REFINED]]
             for y in up[::_REFINED]
         ]
         kernels = _between(np.asarray(exact, dtype=np.float32), len(rows), len(cols))
@@ -238,14 +236,14 @@ def _between(exact: NDArray[np.float32], rows: int, cols: int) -> NDArray[np.flo
 
 @lru_cache(maxsize=2048)  # photos of one lens and frame share all their kernels, 50 MB at most
 def _kernel(
-    lens: CameraLens, settings: LensSettings, h: tuple[float, float], frame: Frame, options: BlurOptions
+    lens: CameraLens, settings: LensSettings, h: tuple[float, float], frame: Frame, pitch_um: float, size: int
 ) -> NDArray[np.float64]:
     channel: Channel = settings.channel
     offset, r = (0.0, 0.0), math.hypot(*h)
     if channel != "g" and r > 0:
         outwards = lens.lateral_shift(r, channel, settings.focal_mm) * frame.half_diagonal
         offset = (-outwards * h[1] / r, outwards * h[0] / r)
-    return lens.kernel_at_field(h, settings, options.size, pitch_um=options.pitch_um, offset=offset)
+    return lens.kernel_at_field(h, settings, size, pitch_um=pitch_um, offset=offset)
 
 
 _BASE_ISO_ELECTRONS = 40000.0  # full well at ISO 100

@@ -15,7 +15,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import centroid
 from lensmodel.core.types import CHANNELS, FieldPosition, Frame, LensSettings
 from lensmodel.photo import develop
-from lensmodel.simulate import BlurOptions, SimulatedCamera, blurred, photograph, write_photo
+from lensmodel.simulate import SimulatedCamera, blurred, photograph, write_photo
 
 DATA = Path(__file__).parents[1] / "lensmodel" / "data"
 GRIDS = sorted(DATA.glob("traced-*.npz"))
@@ -85,8 +85,7 @@ def points_at(*places: tuple[int, int]) -> np.ndarray:
     scene = np.zeros((3, 134, 174), dtype=np.float32)
     for row, col in places:
         scene[:, 7 + row, 7 + col] = 1.0
-    options = BlurOptions(size=15, step=0.25)
-    return blurred(scene, GridLens(linear_field()), LensSettings(), Frame(120, 160), options)
+    return blurred(scene, GridLens(linear_field()), LensSettings(), Frame(120, 160), size=15, step=0.25)
 
 
 def test_point_light_becomes_the_kernel_of_its_place_and_red_lies_further_out() -> None:
@@ -102,8 +101,8 @@ def test_point_light_becomes_the_kernel_of_its_place_and_red_lies_further_out() 
 def test_camera_writes_raw_photos_through_a_traced_lens(tmp_path: Path) -> None:
     grid, camera = read_grid(GRIDS[0]), SimulatedCamera(height=160, width=240)
     scene, rng = dead_leaves(160, 240, np.random.default_rng(1)), np.random.default_rng(2)
-    settings, options = LensSettings(aperture=grid.f_number), BlurOptions(size=25, step=0.5)
-    photo = photograph(scene, GridLens(grid), settings, camera, rng, options=options)
+    settings = LensSettings(aperture=grid.f_number)
+    photo = photograph(scene, GridLens(grid), settings, camera, rng, size=25, step=0.5)
     write_photo(tmp_path / "a.dng", photo)
 
     assert develop(tmp_path / "a.dng").planes.shape == (3, 160, 240)

@@ -18,15 +18,7 @@ from lensmodel.model import LensModel
 from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.development import photo_from_array
-from lensmodel.simulate import (
-    BlurOptions,
-    SimulatedCamera,
-    SimulatedPhoto,
-    demo_scene,
-    draw_lens,
-    photograph,
-    write_photo,
-)
+from lensmodel.simulate import SimulatedCamera, SimulatedPhoto, demo_scene, draw_lens, photograph, write_photo
 
 LENS = draw_lens(5, "soft-fast")  # blurred in the center too: there is something to gain everywhere
 CAMERA = SimulatedCamera(height=320, width=480, pitch_um=9.0)
@@ -35,9 +27,9 @@ SETTINGS = LensSettings(aperture=LENS.at_focal().f_number)
 
 def taken(name: str, folder: Path, seed: int) -> tuple[Path, SimulatedPhoto]:
     scene = demo_scene(name)[:, 200 : 200 + CAMERA.height + 32, 400 : 400 + CAMERA.width + 32]
-    options = BlurOptions(pitch_um=CAMERA.pitch_um, step=0.5, size=31)  # coarse nodes: seconds, not minutes
     rng = np.random.default_rng(seed)
-    shot = photograph(np.ascontiguousarray(scene), LENS, SETTINGS, CAMERA, rng, options=options)
+    # coarse nodes: seconds, not minutes
+    shot = photograph(np.ascontiguousarray(scene), LENS, SETTINGS, CAMERA, rng, size=31, step=0.5)
     path = folder / f"{name}.dng"
     write_photo(path, shot)
     return path, shot

@@ -13,7 +13,7 @@ from lensmodel.core.types import BayerPattern, Channel, FieldPosition, Frame, Le
 from lensmodel.correction import PsfPosterior, correct_planes
 from lensmodel.correction.expected_gain import noise_power, ring_power
 from lensmodel.photo import develop
-from lensmodel.simulate import BlurOptions, SimulatedCamera, draw_lens, photograph, write_photo
+from lensmodel.simulate import SimulatedCamera, draw_lens, photograph, write_photo
 
 BAYER: Final = ((0, 1), (1, 2))
 
@@ -61,8 +61,9 @@ def test_noise_of_a_developed_mosaic_is_spread_as_it_is_reckoned_with(tmp_path: 
     camera, lens = SimulatedCamera(height=960, width=960, full_well_electrons=20_000.0), draw_lens(3)
     even = np.full((3, 1040, 1040), 0.1, dtype=np.float32)
     settings = LensSettings(aperture=lens.widest())
-    options, rng = BlurOptions(size=9, step=0.5), np.random.default_rng(2)  # no blur shows on an even scene
-    write_photo(tmp_path / "even.dng", photograph(even, lens, settings, camera, rng, options=options))
+    rng = np.random.default_rng(2)
+    # no blur shows on an even scene
+    write_photo(tmp_path / "even.dng", photograph(even, lens, settings, camera, rng, size=9, step=0.5))
     planes = develop(tmp_path / "even.dng").planes
 
     parts = [planes[:, i : i + 200, j : j + 200] for i in range(64, 700, 200) for j in range(64, 700, 200)]

@@ -26,15 +26,7 @@ from lensmodel.quality import (
     slanted_edge,
     tangential_sagittal_mtf50,
 )
-from lensmodel.simulate import (
-    Aberrations,
-    BlurOptions,
-    SimulatedLens,
-    blurred,
-    demo_scene,
-    edge_chart,
-    slanted_edge_scene,
-)
+from lensmodel.simulate import Aberrations, SimulatedLens, blurred, demo_scene, edge_chart, slanted_edge_scene
 
 STEP = 0.6
 
@@ -192,8 +184,7 @@ def test_photographed_chart_agrees_with_the_kernels_own_mtf() -> None:
     comatic = SimulatedLens((Aberrations(2.8, decentring=(0.1, 0.1), **terms),))
     frame = Frame(720, 960)
     chart = edge_chart(frame, margin=16, guard=16)
-    options = BlurOptions(size=31, step=0.16)
-    image = blurred(chart.scene, comatic, LensSettings(), frame, options)[1]
+    image = blurred(chart.scene, comatic, LensSettings(), frame, size=31, step=0.16)[1]
     measured = measure_edges(image, [edge.box for edge in chart.edges])
 
     assert len(measured) == len(chart.edges)

@@ -25,7 +25,6 @@ from lensmodel.simulate import (
     DEMO_SCENES,
     LENS_KINDS,
     Aberrations,
-    BlurOptions,
     SimulatedCamera,
     SimulatedLens,
     blurred,
@@ -229,7 +228,7 @@ def test_drawn_lenses_have_centred_kernels_of_realistic_widths(kind: str) -> Non
 FRAME = Frame(240, 360)
 SIZE = 31
 HALF = SIZE // 2
-COARSE = BlurOptions(size=SIZE, step=0.5)
+COARSE = {"size": SIZE, "step": 0.5}
 
 
 class Grey(SimulatedLens):
@@ -264,7 +263,7 @@ def lights(comatic: SimulatedLens) -> tuple[Planes, list[tuple[int, int]]]:
         for row, col in np.argwhere(scene[0]).tolist()
         if 2 * HALF <= row < FRAME.height and 2 * HALF <= col < FRAME.width
     ]
-    image = blurred(scene, comatic, LensSettings(), FRAME, BlurOptions(size=SIZE, step=0.12))
+    image = blurred(scene, comatic, LensSettings(), FRAME, size=SIZE, step=0.12)
     return image, inside
 
 
@@ -291,7 +290,7 @@ def test_lateral_colour_moves_red_and_blue_as_the_lens_says() -> None:
     scene = np.zeros((3, FRAME.height, FRAME.width), dtype=np.float32)
     row, col = 45, 300
     scene[:, row, col] = 1.0
-    image = blurred(scene, fringed, LensSettings(), FRAME, BlurOptions(size=SIZE, step=0.2))
+    image = blurred(scene, fringed, LensSettings(), FRAME, size=SIZE, step=0.2)
     position = FRAME.position(row, col)
     seen = {
         c: np.array(centroid(image[i, row - HALF : row + HALF + 1, col - HALF : col + HALF + 1]))
@@ -308,8 +307,7 @@ def test_photo_of_a_constant_is_constant() -> None:
     # defocused, since the centre of mass of a kernel much sharper than a pixel jumps between
     # places by a tenth of a pixel, and that distortion is brightness
     soft = Grey((Aberrations(f_number=2.8, astigmatism=1.0, coma=1.0, defocus=2.0),))
-    options = BlurOptions(size=SIZE, step=0.25)
-    image = blurred(constant(FRAME.height, FRAME.width), soft, LensSettings(), FRAME, options)
+    image = blurred(constant(FRAME.height, FRAME.width), soft, LensSettings(), FRAME, size=SIZE, step=0.25)
 
     assert np.abs(image / 0.5 - 1.0).max() < 1e-3
 
@@ -318,7 +316,7 @@ def test_scene_beyond_the_frame_shines_into_it() -> None:
     soft, scene = Grey((Aberrations(f_number=4.0, defocus=4.0),)), constant(96 + 2 * HALF, 96 + 2 * HALF, 0.0)
     scene[:, :, : HALF - 2] = 1.0  # a bright wall that ends three pixels left of the frame
 
-    assert blurred(scene, soft, LensSettings(), Frame(96, 96), COARSE)[1, 48, 0] > 0.02
+    assert blurred(scene, soft, LensSettings(), Frame(96, 96), **COARSE)[1, 48, 0] > 0.02
 
 
 def test_noise_has_the_variance_of_the_noise_model() -> None:
@@ -347,7 +345,7 @@ def test_overexposure_clips_at_the_white_level() -> None:
     camera = SimulatedCamera(64, 64, white_balance=(1, 1, 1))
     scene = constant(64, 64, 0.7)
     photo = photograph(
-        scene, PERFECT, LensSettings(), camera, np.random.default_rng(1), exposure=2.0, options=COARSE
+        scene, PERFECT, LensSettings(), camera, np.random.default_rng(1), exposure=2.0, **COARSE
     )
 
     assert photo.mosaic.max() == camera.white
@@ -361,7 +359,7 @@ def test_written_photo_opens_in_libraw_with_its_lens_and_its_colours(tmp_path: P
     scene[:] = np.array([0.6, 0.3, 0.1])[:, None, None]
     zoom = draw_lens(1, "zoom")
     settings = LensSettings(aperture=5.6, focal_mm=zoom.focal_mm[1], focus_m=math.inf)
-    photo = photograph(scene, zoom, settings, camera, None, options=COARSE)
+    photo = photograph(scene, zoom, settings, camera, None, **COARSE)
     write_photo(tmp_path / "photo.dng", photo)
 
     with rawpy.imread(str(tmp_path / "photo.dng")) as raw:
@@ -453,9 +451,9 @@ def light(level: float = 0.5, *, exposure: float = 1.0) -> None:
         (lambda: SimulatedCamera(read_noise=math.nan), "read_noise"),
         (lambda: light(exposure=0.0), "exposure"),
         (lambda: light(-1.0), "scene"),
-        (lambda: blurred(constant(100, 100), PERFECT, LensSettings(), FRAME, COARSE), "must exceed"),
-        (lambda: blurred(constant(240, 360)[0], PERFECT, LensSettings(), FRAME, COARSE), "shape"),
-        (lambda: BlurOptions(step=0.0), "step"),
+        (lambda: blurred(constant(100, 100), PERFECT, LensSettings(), FRAME, **COARSE), "must exceed"),
+        (lambda: blurred(constant(240, 360)[0], PERFECT, LensSettings(), FRAME, **COARSE), "shape"),
+        (lambda: blurred(constant(200, 300), PERFECT, LensSettings(), FRAME, step=0.0), "step"),
         (lambda: edge_chart(Frame(200, 300)), "at least"),
         (lambda: demo_scene("nowhere"), "colosseum"),
         (lambda: demo_data_path("nowhere.png"), "known"),

@@ -60,8 +60,6 @@ _FALLS: Final = ((0.8, "nearly as sharp"), (0.5, "clearly softer"), (0.0, "much 
 _LEVELS: Final = ((0.35, "very sharp"), (0.2, "sharp"), (0.1, "a little soft"), (0.0, "soft"))
 _ASPECTS: Final = (1.0, 4 / 3, 1.5, 16 / 9)
 _FILLED: Final = 0.85  # of the way to a side that samples reach at least (chosen: patches end short of it)
-_ALIKE: Final = 0.05  # share by which zones may differ and still be called alike: less is not seen (chosen)
-_ZONE_WORDS: Final = dict(zip(ZONES, ("in the centre", "halfway out", "in the corners"), strict=True))
 
 CAUTION: Final = "Caution"  # name among the details of a report of what to allow for in its figures
 _NAMED: Final = 8  # photos that a report names (chosen: two lines)
@@ -509,19 +507,6 @@ def _frequencies(pitch_um: float | None) -> list[tuple[float, float | None]]:
     step = next((step for step in _STEPS_MM if 4.0 * step <= nyquist / 2.0), _STEPS_MM[-1])
     pairs = [(k * step * pitch_um / 1000.0, k * step) for k in range(1, 5)]
     return [(f, lp) for f, lp in pairs if f <= NYQUIST]
-
-
-def compare(first: LensReport, second: LensReport) -> str:
-    """Say in which zones the second copy is sharper or softer, each at the first aperture of its report."""
-    one, two = first.tested[0].zones, second.tested[0].zones
-    changes = []
-    for zone, where in _ZONE_WORDS.items():
-        share = two[zone] / one[zone] - 1.0
-        how = f"{abs(share):.0%} {'sharper' if share > 0 else 'softer'}"
-        changes.append(f"{'about the same' if abs(share) < _ALIKE else how} {where}")
-    numbers = (" (1)", " (2)") if first.name == second.name else ("", "")
-    names = [report.name + number for report, number in zip((first, second), numbers, strict=True)]
-    return f"Compared with {names[0]}, {names[1]} is {', '.join(changes[:-1])} and {changes[-1]}."
 
 
 # --- places of the field -------------------------------------------------------------------------

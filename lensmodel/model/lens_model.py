@@ -86,7 +86,7 @@ class LensModel:
         weights = np.concatenate([s * part.weights for s, part in zip(shares, parts, strict=True)])
         photos = np.concatenate([part.photos for part in parts])
         names, number = np.unique(photos.astype(str), return_inverse=True)
-        beyond = set.intersection(*(set(part.support.beyond) for part in parts))
+        beyond = set.intersection(*(set(part.beyond) for part in parts))
         return PsfAnswer(
             kernel=kernel,
             predicted_error=min(float(precision.sum() ** -0.5), 1.0),

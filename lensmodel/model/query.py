@@ -9,7 +9,7 @@ By the one the regression weighs samples (paper, eq. 7), in bandwidths::
 with c on the unit circle, so that pi and -pi are neighbours: |c - c_i| is the chord 2 sin(d/2).
 Near the centre of the image all angles are neighbours, so the circle shrinks with r there.
 
-The other, `Support`, says how far a question lies from all samples, in units in which a PSF changes by about
+The other, `support`, says how far a question lies from all samples, in units in which a PSF changes by about
 as much. They do not shrink as samples come, as bandwidths do: what is near stays near::
 
     d^2 = |p - p_i|^2 / 0.2^2 + (stops apart)^2 + (octaves of focal length apart / 0.5)^2
@@ -90,25 +90,17 @@ def in_units(position: FieldPosition, settings: LensSettings) -> NDArray[np.floa
     return np.array([*position.xy, *_numbers(settings)]) / UNITS
 
 
-@dataclass(frozen=True, slots=True)
-class Support:
-    """Distance to the nearest sample in units, and in which of `VARIABLES` all samples are far."""
-
-    nearest: float
-    beyond: tuple[str, ...]
-
-    @classmethod
-    def of(cls, where: NDArray[np.float64], asked: NDArray[np.float64]) -> Support:
-        """Measure how far a point `(5,)` lies from others `(n, 5)`."""
-        gaps = np.abs(where - asked)
-        gaps[np.isnan(gaps)] = 0.0
-        each = np.concatenate([np.hypot(gaps[:, :1], gaps[:, 1:2]), gaps[:, 2:]], axis=1)
-        distance = np.sqrt((each**2).sum(axis=1))
-        nearest = int(distance.argmin())
-        beyond = [name for name, least in zip(VARIABLES, each.min(axis=0), strict=True) if least > FAR]
-        if not beyond and distance[nearest] > FAR:
-            beyond = [VARIABLES[int(each[nearest].argmax())]]
-        return cls(float(distance[nearest]), tuple(beyond))
+def support(where: NDArray[np.float64], asked: NDArray[np.float64]) -> tuple[float, tuple[str, ...]]:
+    """Distance from a point `(5,)` to the nearest of `(n, 5)`, and in which of `VARIABLES` all are far."""
+    gaps = np.abs(where - asked)
+    gaps[np.isnan(gaps)] = 0.0
+    each = np.concatenate([np.hypot(gaps[:, :1], gaps[:, 1:2]), gaps[:, 2:]], axis=1)
+    distance = np.sqrt((each**2).sum(axis=1))
+    nearest = int(distance.argmin())
+    beyond = [name for name, least in zip(VARIABLES, each.min(axis=0), strict=True) if least > FAR]
+    if not beyond and distance[nearest] > FAR:
+        beyond = [VARIABLES[int(each[nearest].argmax())]]
+    return float(distance[nearest]), tuple(beyond)
 
 
 # --- what is asked and answered ------------------------------------------------------------------
@@ -161,5 +153,5 @@ class Part:
     error: float  # expected relative L2
     weights: NDArray[np.float64]  # (n,), of the samples in the answer, of sum 1
     photos: NDArray[np.object_]  # (n,), of these samples
-    support: Support
+    beyond: tuple[str, ...]  # variables in which the question lies far from all of them
     ring_error: NDArray[np.float64] | None = None

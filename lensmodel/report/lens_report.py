@@ -89,11 +89,9 @@ class SensorGeometry:
     @property
     def units(self) -> dict[Unit, float]:
         """Factors of cycles/pixel in the units that are known: LP/PH = H f, lp/mm = 1000 f / p."""
-        height, pitch = self.height_px, self.pixel_pitch_um
-        factors: dict[Unit, float | None] = {
-            "c/px": 1.0, "lp/ph": height and float(height), "lp/mm": pitch and 1000.0 / pitch
-        }  # fmt: skip
-        return {unit: factor for unit, factor in factors.items() if factor}
+        per_mm = self.pixel_pitch_um and 1000.0 / self.pixel_pitch_um
+        factors: dict[Unit, float | None] = {"c/px": 1.0, "lp/ph": self.height_px, "lp/mm": per_mm}
+        return {unit: float(factor) for unit, factor in factors.items() if factor}
 
     def words(self, frequency: float, unit: Unit = "c/px", between: Range | None = None) -> str:
         """Write a frequency given in cycles/pixel, with its range; beyond Nyquist's only "at least" it."""

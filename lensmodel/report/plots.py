@@ -24,7 +24,6 @@ try:
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.image import AxesImage
     from matplotlib.patches import Circle, Rectangle
-    from matplotlib.ticker import MaxNLocator
 except ModuleNotFoundError as error:
     raise InvalidInputError("drawing needs matplotlib: pip install 'lensmodel[report]'") from error
 
@@ -233,10 +232,7 @@ def _maps(place: Place, found: ApertureReport, factor: float) -> None:
     image = _map(axes[1], found, [spot.sagittal for spot in found.map], factor)
     axes[0].set_xlabel("tangential (T)")
     axes[1].set_xlabel("sagittal (S)")
-    scale = place.colorbar(image, ax=axes, location="bottom", fraction=0.05, aspect=50)
-    round_ticks = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, NYQUIST * factor)
-    ticks = [tick / factor for tick in round_ticks if tick <= NYQUIST * factor]
-    scale.set_ticks(ticks, labels=[_number(tick, factor) for tick in ticks])
+    place.colorbar(image, ax=axes, location="bottom", fraction=0.05, aspect=50)
 
 
 def _map(ax: Axes, found: ApertureReport, values: Sequence[float], factor: float = 1.0) -> AxesImage:
@@ -244,11 +240,11 @@ def _map(ax: Axes, found: ApertureReport, values: Sequence[float], factor: float
     ax.grid(visible=False)
     ax.set(xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
-    shown = np.clip(values, 0.0, NYQUIST)
+    most, extent = factor * NYQUIST, (0.0, found.aspect, 0.0, 1.0)
+    shown = np.clip(np.multiply(values, factor), 0.0, most)
     image = ax.imshow(
-        shown.reshape(found.rows, found.cols), cmap=_SHARPNESS, vmin=0.0, vmax=NYQUIST,
-        extent=(0.0, found.aspect, 0.0, 1.0),
-    )  # fmt: skip
+        shown.reshape(found.rows, found.cols), cmap=_SHARPNESS, vmin=0.0, vmax=most, extent=extent
+    )
     wide, high = found.aspect / found.cols, 1.0 / found.rows
     for i, (value, spot) in enumerate(zip(shown, found.map, strict=True)):
         row, col = divmod(i, found.cols)
@@ -257,14 +253,14 @@ def _map(ax: Axes, found: ApertureReport, values: Sequence[float], factor: float
             ax.add_patch(Rectangle((left, low), wide, high, **_HATCHED))
         else:
             pale = np.dot(image.to_rgba(value)[:3], _LUMA) > _PALE
-        word, ink = (">" if value >= NYQUIST else "") + _number(value, factor), _BLACK if pale else "#ffffff"
+        word, ink = (">" if value >= most else "") + _number(value, factor), _BLACK if pale else "#ffffff"
         ax.text(left + wide / 2, low + high / 2, word, color=ink, **_IN_CELL)
     return image
 
 
 def _number(value: float, factor: float) -> str:
     if factor != 1.0:
-        return f"{value * factor:.0f}"
+        return f"{value:.0f}"
     return f"{value:.3f}" if 0.0 < value < 0.02 else f"{value:.2f}".removeprefix("0")
 
 

@@ -111,11 +111,7 @@ def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [
-        ("report", NAME, "-o", "mine.html"),
-        ("report", "nobodys.lensprofile", "-o", "out"),
-        ("target", "."),
-    ],
+    [("report", NAME, "-o", "mine.html"), ("report", "nobodys.lensprofile", "-o", "out"), ("target", ".")],
 )
 def test_what_cannot_be_written_is_refused_before_anything_is(
     folder: Path, green_alone: None, words: tuple[str, ...]

@@ -5,18 +5,13 @@ scene x,  z = h * x + n  and  y = k * x + n', so that x = z deconvolved by h is 
 open photo y blurs, once it is laid under y to a part of a pixel. It keeps noise of its own, whose
 autocovariance is taken off where kernels are solved for.
 
-Of what a mosaic says of x at high frequencies much is light of others, f - s: green is sampled on a
-checkerboard, s = (1/2, 1/2), red and blue on every second row and column. With the power S of the picture,
-the part of it that is no picture has about  a sum_s S(f - s),  and a kernel is drawn towards nothing there as
-far as that outweighs the data; else it comes out with a checkerboard of its own.
-
 Where a scene has detail everywhere no flat place shows the noise, and five times as much would be estimated:
 the power of the finest detail in the quietest place is an upper bound of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import ClassVar, Final
@@ -41,12 +36,6 @@ _DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised
 _STOPS_APART: Final = 2.0  # least: blur that both photos share is missing in the kernel (chosen)
 _COARSE: Final = 4  # photos are shrunk so far for the first match: a nudged tripod is within reach (chosen)
 _NOISE_GRID: Final = 128  # frequencies along an axis: its lags have to hold two kernels (chosen)
-_RINGS: Final = 16  # of 0 to 0.5 cycles/pixel: a window has few frequencies for each of more (chosen)
-# Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least
-# error for the lens of development (third order, 4). Measured once, no command repeats it
-_ALIASED: Final = 0.03
-# Frequencies (row, col) of a colour's grid in a mosaic, against which its aliases are mirrored
-_ALIASES: Final = {"g": ((0.5, 0.5),), **dict.fromkeys("rb", ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5)))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,28 +147,8 @@ def _scene(
 
     f = fft.fftfreq(_NOISE_GRID)
     power = np.square(inverse(f[:, None], f)) * closed.noise[index].variance(region.mean())
-    if closed.cfa is not None:  # what demosaicing made up is no noise
-        power_at = _power_by_frequency(moved((0.0, 0.0), 0))
-        for row, col in _ALIASES[channel]:
-            power -= _ALIASED * power_at(np.hypot((row - abs(f))[:, None], col - abs(f)))
     lags = np.arange(-(size - 1), size)
     return moved, fft.ifft2(power).real[np.ix_(lags, lags)]
-
-
-def _power_by_frequency(window: NDArray[np.floating]) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """Mean power of a window by frequency in cycles/pixel; of white noise its variance."""
-    side = min(window.shape)
-    taper = np.outer(np.hanning(side), np.hanning(side))
-    part = (window[:side, :side] - window[:side, :side].mean()) * taper
-    power = np.square(np.abs(fft.fft2(part))) / np.square(taper).sum()
-    modulus = np.hypot(*np.meshgrid(fft.fftfreq(side), fft.fftfreq(side), indexing="ij"))
-    edges = np.linspace(0.0, 0.5, _RINGS + 1)
-    ring = np.digitize(modulus.ravel(), edges) - 1
-    inside = ring < _RINGS
-    total = np.bincount(ring[inside], power.ravel()[inside], minlength=_RINGS)
-    mean = np.maximum(total / np.bincount(ring[inside], minlength=_RINGS), 1e-12)
-    at = np.log(0.5 * (edges[1:] + edges[:-1]))
-    return lambda f: np.exp(np.interp(np.log(np.maximum(f, 1e-3)), at, np.log(mean)))
 
 
 def _detailed(

@@ -341,29 +341,6 @@ def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
     assert steps.count((0, 1)) > 50  # aligning them shows, too
 
 
-@pytest.mark.slow  # twice the kernel of a pair, which the test before finds as it is
-def test_what_demosaicing_makes_up_does_not_come_into_the_kernel_of_a_pair(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    sides = [n + 2 * targets.MARGIN for n in SHAPE]
-    f = np.hypot(np.fft.fftfreq(sides[0])[:, None], np.fft.rfftfreq(sides[1]))
-    waves = np.fft.rfft2(np.random.default_rng(6).standard_normal(sides)) / np.maximum(f, 0.01)
-    natural = np.fft.irfft2(waves, sides)
-    scene = np.clip(0.4 + 0.12 * natural / natural.std(), 0.05, 0.9)
-    moved = moved_scene(scene.astype(np.float32), (0.4, -0.7), 0.05)
-    pair = [photo_of(scene, lopsided()), photo_of(moved, at_f8(), 1, 8.0)]
-    for photo in pair:  # green as the sensor saw it on a checkerboard, and the mean of neighbours between
-        seen = np.indices(SHAPE).sum(axis=0) % 2 == 1
-        cross = [[0, 0.25, 0], [0.25, 0, 0.25], [0, 0.25, 0]]
-        photo.planes[1] += np.where(
-            seen, 0.0, ndimage.convolve(photo.planes[1] * seen, cross) - photo.planes[1]
-        )
-
-    now = error_of_pair(pair, 128)
-    monkeypatch.setattr("lensmodel.measured.pair._ALIASED", 0.0)
-    assert now < 0.8 * error_of_pair(pair, 128)
-
-
 def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
     # the left of the frame is quiet
     contrast = np.clip(np.linspace(-0.06, 0.3, PAIR_SHAPE[1] + 2 * targets.MARGIN), 0.0, 0.12)

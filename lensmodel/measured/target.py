@@ -28,7 +28,7 @@ M. Delbracio et al., IJCV 96, 2012, section 4, who show that white noise determi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -69,10 +69,6 @@ MEAN: Final = 0.5  # reflectance of the noise, halfway between ink, 0, and paper
 # Standard deviation of the noise as a share of the paper's white: 3 of them reach ink and paper
 CONTRAST: Final = 0.17
 _PAGE_SEED: Final = 20120  # any number: printed pages depend on it, so it stays
-# Samples along the long side: 0.07 mm each on the largest paper, about as fine as greys are printed (chosen)
-_LARGEST: Final = 8000
-# Samples along the long side: coarser noise holds no frequency that a lens takes away (chosen)
-_SMALLEST: Final = 200
 
 
 @dataclass(frozen=True)
@@ -83,12 +79,6 @@ class TargetPage:
     """
 
     detail: int  # samples along the long side
-
-    def __post_init__(self) -> None:
-        if not _SMALLEST <= self.detail <= _LARGEST:
-            raise InvalidInputError(
-                f"a page has {_SMALLEST} to {_LARGEST} samples along its long side, not {self.detail}"
-            )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -388,12 +378,10 @@ def _tones_in(window: Window, placed: PlacedPage) -> tuple[NDArray[np.float64], 
     light, outer = window_terms(side, half) @ terms, (side + 2 * half,) * 2
     start = row - half - shift[0], col - half - shift[1]
     pages = [replace(placed, tones=tones).window(*start, outer) * light for tones in _POWERS]
-    blurred = [signal.fftconvolve(page, kernel, mode="valid")[good] for page in pages]
-    basis, observed = np.column_stack([*blurred, window_terms(side, 0)[good]]), window.light[good]
-    terms, *_ = np.linalg.lstsq(basis, observed, rcond=None)
+    basis, terms = _explained(window, pages, kernel)
     if not terms[0] > 0.0:
         raise NotEnoughEvidenceError("a window shows a negative of the page")
-    left = float(np.square(observed - basis @ terms).sum()) / max(observed.size - terms.size, 1)
+    left = float(np.square(window.light[good] - basis @ terms).sum()) / max(len(basis) - terms.size, 1)
     # only the part of the two columns that the others cannot explain determines q and c
     others = np.delete(basis, (1, 2), axis=1)
     separable = basis[:, 1:3] - others @ np.linalg.lstsq(others, basis[:, 1:3], rcond=None)[0]
@@ -402,13 +390,21 @@ def _tones_in(window: Window, placed: PlacedPage) -> tuple[NDArray[np.float64], 
 
 def _fitted_light(window: Window, page: NDArray[np.floating], kernel: Kernel) -> NDArray[np.float64]:
     """Terms (6,) of a quadratic in row and column, whose mean over its square window is 1."""
-    side, good = len(window.light), window.measured
-    if int(good.sum()) < _FEWEST:
+    side = len(window.light)
+    if int(window.measured.sum()) < _FEWEST:
         raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
-    outer, inner = window_terms(side, len(kernel) // 2), window_terms(side, 0)
-    lit = [signal.fftconvolve(page * outer[..., j], kernel, mode="valid")[good] for j in range(6)]
-    terms, *_ = np.linalg.lstsq(np.column_stack([*lit, inner[good]]), window.light[good], rcond=None)
-    light = inner @ terms[:6]
+    lit = page * np.moveaxis(window_terms(side, len(kernel) // 2), -1, 0)
+    terms = _explained(window, lit, kernel)[1][:6]
+    light = window_terms(side, 0) @ terms
     if not float(light.min()) > 0.0:
         raise NotEnoughEvidenceError("a window of the page is black, or does not show the page; light it")
-    return np.asarray(terms[:6] / float(light.mean()))
+    return np.asarray(terms / float(light.mean()))
+
+
+def _explained(
+    window: Window, pages: Iterable[NDArray[np.floating]], kernel: Kernel
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Columns of blurred pages and of light laid over them at the measured pixels, and the share of each."""
+    blurred = [signal.fftconvolve(page, kernel, mode="valid")[window.measured] for page in pages]
+    basis = np.column_stack([*blurred, window_terms(len(window.light), 0)[window.measured]])
+    return basis, np.linalg.lstsq(basis, window.light[window.measured], rcond=None)[0]

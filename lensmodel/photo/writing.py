@@ -249,12 +249,7 @@ def shown(planes: Planes, encoding: Encoding) -> NDArray[np.uint8]:
 
 BAYER_PATTERNS: Final = ("RGGB", "BGGR", "GRBG", "GBRG")
 
-XYZ_TO_SRGB: Final = (
-    (3.2404542, -1.5371385, -0.4985314),
-    (-0.9692660, 1.8760108, 0.0415560),
-    (0.0556434, -0.2040259, 1.0572252),
-)
-"""CIE XYZ (D65) to linear sRGB, IEC 61966-2-1."""
+XYZ_TO_SRGB: Final = np.linalg.inv(SRGB_TO_XYZ_D65)
 
 UNKNOWN: Final = PhotoMetadata()
 

@@ -44,7 +44,7 @@ def measure(
 
     - target: the page that `lensmodel target` prints, photographed flat, nearly filling the frame.
 
-    - pair: one scene from a tripod, wide open and at about f/8. Photos are given in pairs.
+    - pair: one scene from a tripod, wide open and at about f/8, given in pairs, the open photo first.
 
     - points: stars, or pinholes in front of a lamp; not saturated.
 
@@ -62,11 +62,11 @@ def measure(
     paths = files.photos(photos, shown.note)
     files.refuse_photo(profile, paths)
     with files.as_usage():
-        method, groups = measuring.methods.create(kind), measuring.measurements_of(kind, paths)
         store = files.ProfileFile(profile)
         config = configured(store.model, LensSettings(aperture=aperture))
         calibration = Calibration(store, config, any_lens=any_lens)
-    results: list[dict[str, Any]] = []
+    method, results = measuring.methods.create(kind), list[dict[str, Any]]()
+    groups = [paths[at : at + method.photos] for at in range(0, len(paths), method.photos)]
     with shown.progress(total=len(groups)) as bar:
         for number, group in enumerate(groups):
             bar.show(description=f"{group[0].name}: measuring")

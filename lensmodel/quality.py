@@ -293,10 +293,7 @@ _LEAST_STEP: Final = 0.02  # of full scale
 _LEAST_COHERENCE: Final = 0.9  # of the structure tensor: one straight edge and nothing else (chosen)
 # ISO 12233 wants slants; along pixels and diagonals the super-sampling fails
 _LEAST_SLANT, _MOST_SLANT = math.radians(2.0), math.radians(43.0)
-_NARROW: Final = 0.2  # scatter of the gradients across the edge, in sides of a window
-_BESIDE: Final = 0.05  # of the squared gradients, further from the edge than a quarter of a window
-_MOST: Final = 1 << 16  # windows of the grid that are looked at more closely
-_CHUNK: Final = 4096  # of them at once, for memory
+_NARROW: Final = 0.12  # scatter of the squared gradients across the edge, in sides of a window (chosen)
 _TRIED: Final = 2000  # edges at full size: more than any chart has
 _FIRST: Final = 60  # edges tried of which some must be a chart's, or the photo is none (chosen for time)
 _LEAST_OF_USUAL: Final = 0.25  # of the median step: a fold or a shadow on the paper is no edge of the print
@@ -362,58 +359,47 @@ def _edge_on(
 
 
 def _segments(means: NDArray[np.float32]) -> list[NDArray[np.float64]]:
-    """Ends of edges, as runs of windows that each hold one straight edge and no more, strongest first."""
-    across, down = np.zeros((2, *means.shape), dtype=np.float32)
+    """Ends of edges, as runs of windows that each hold one straight edge and no more, strongest first.
+
+    Where the squared gradients of a window have their centre of mass its edge passes, and they scatter little
+    across it.
+    """
+    across, down = np.zeros((2, *means.shape))
     across[:, 1:-1] = (means[:, 2:] - means[:, :-2]) / 2
     down[1:-1] = (means[2:] - means[:-2]) / 2
-    xx, yy, xy = (_sums(product) for product in (across * across, down * down, across * down))
-    energy = xx + yy
-    coherence = np.hypot(xx - yy, 2 * xy) / np.maximum(energy, np.finfo(np.float32).tiny)
-    angle = np.arctan2(2 * xy, xx - yy) / 2  # of the normal; rows count downwards
+    weight = across * across + down * down
+    x, y = np.arange(means.shape[1]), np.arange(means.shape[0])[:, None]
+    energy = _sums(weight)
+    xx, xy, mean_x, mean_y, var_x, cov, var_y = (
+        _sums(product) / energy
+        for product in (
+            across * across,
+            across * down,
+            *(weight * part for part in (x, y, x * x, x * y, y * y)),
+        )
+    )
+    coherence = np.hypot(2 * xx - 1, 2 * xy)
+    angle = np.arctan2(2 * xy, 2 * xx - 1) / 2  # of the normal; rows count downwards
+    cos, sin = np.cos(angle), np.sin(angle)
+    middle_y, middle_x = _STRIDE * np.indices(energy.shape) + (_WINDOW - 1) / 2
+    offset = cos * (mean_x - middle_x) + sin * (mean_y - middle_y)
+    var_x, cov, var_y = var_x - mean_x**2, cov - mean_x * mean_y, var_y - mean_y**2
+    scatter = cos * cos * var_x + 2 * cos * sin * cov + sin * sin * var_y
     slant = np.abs((angle + np.pi / 4) % (np.pi / 2) - np.pi / 4)
     # A step s that is spread over w means makes s² / w in each of the lines it crosses, w <= half a window.
-    strong = energy > 2 * _LEAST_STEP**2
-    good = strong & (coherence > _LEAST_COHERENCE) & (slant > _LEAST_SLANT) & (slant < _MOST_SLANT)
-    order = np.flatnonzero(good)
-    order = order[np.argsort(-energy.ravel()[order], kind="stable")][:_MOST]
-    middles = np.full((*energy.shape, 2), np.nan)
-    kinds = np.zeros(energy.shape, dtype=np.int8)  # 1 upright, 2 lying, negative where it falls; 0 no edge
-    for start in range(0, order.size, _CHUNK):
-        index = np.unravel_index(order[start : start + _CHUNK], energy.shape)
-        upright = np.abs(np.cos(angle[index])) > math.sqrt(0.5)
-        kept, middles[index], sign = _on_one_line(across, down, index, angle[index])
-        kinds[index] = np.where(kept, np.where(upright, 1, 2) * sign, 0)
+    kept = (energy > 2 * _LEAST_STEP**2) & (coherence > _LEAST_COHERENCE)
+    kept &= (slant > _LEAST_SLANT) & (slant < _MOST_SLANT)
+    kept &= (scatter < (_NARROW * _WINDOW) ** 2) & (np.abs(offset) < _WINDOW / 4)
+    middles = np.stack([middle_y + 0.5 + offset * sin, middle_x + 0.5 + offset * cos], axis=-1) * _MEAN
+    rises = cos * _sums(across) + sin * _sums(down) >= 0.0
+    upright = np.abs(cos) > math.sqrt(0.5)
     found: list[tuple[float, NDArray[np.float64]]] = []
-    for kind in (-2, -1, 1, 2):
-        labels, _ = ndimage.label(kinds == kind, structure=np.ones((3, 3)))
+    for kind in (upright & rises, upright & ~rises, ~upright & rises, ~upright & ~rises):
+        labels, _ = ndimage.label(kind & kept, structure=np.ones((3, 3)))
         for number, where in enumerate(ndimage.find_objects(labels), start=1):
             own = labels[where] == number
             found.append((float(energy[where][own].sum()), _ends(middles[where][own])))
     return [ends for _, ends in sorted(found, key=lambda pair: -pair[0])]
-
-
-def _on_one_line(
-    across: NDArray[np.float32],
-    down: NDArray[np.float32],
-    index: tuple[NDArray[np.intp], ...],
-    normal: NDArray[np.float32],
-) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.intp]]:
-    """Whether the gradients of windows lie on one line, where it passes their middles, and its sign."""
-    rows, cols = (i * _STRIDE for i in index)
-    views = [sliding_window_view(g, (_WINDOW, _WINDOW))[rows, cols] for g in (across, down)]
-    weight = np.square(views[0]) + np.square(views[1])
-    place = np.arange(_WINDOW, dtype=np.float32) - (_WINDOW - 1) / 2
-    cos, sin = np.cos(normal), np.sin(normal)
-    distance = cos[:, None, None] * place + sin[:, None, None] * place[:, None]
-    total = weight.sum(axis=(1, 2))
-    offset = (weight * distance).sum(axis=(1, 2)) / total
-    across_it = np.abs(distance - offset[:, None, None])
-    scatter = np.sqrt((weight * np.square(across_it)).sum(axis=(1, 2)) / total)
-    beside = np.where(across_it > _WINDOW / 4, weight, 0.0).sum(axis=(1, 2)) / total
-    kept = (scatter < _NARROW * _WINDOW) & (np.abs(offset) < _WINDOW / 4) & (beside < _BESIDE)
-    middle = np.stack([rows + _WINDOW / 2 + offset * sin, cols + _WINDOW / 2 + offset * cos], axis=1) * _MEAN
-    slope = cos * views[0].sum(axis=(1, 2)) + sin * views[1].sum(axis=(1, 2))
-    return kept, middle, np.where(slope >= 0.0, 1, -1)
 
 
 def _ends(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -424,7 +410,7 @@ def _ends(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return center + np.array([[place.min()], [place.max()]]) * along
 
 
-def _sums(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+def _sums(plane: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sums over windows, a quarter of a window apart."""
     blocks = _STRIDE**2 * block_means(plane, _STRIDE)
     return sliding_window_view(blocks, (_WINDOW // _STRIDE,) * 2).sum(axis=(2, 3))

@@ -173,8 +173,22 @@ def _spread_grain(  # noqa: C901, PLR0912 - a few passes over one tile
             mean = fine[i, j] / max(share[i, j], np.float32(1e-3))
             fine[i, j] = luma[i, j] - mean if there[i, j] > ZERO else ZERO
     _coarse(left, known, light, weights, out, luma)
-    _without_noise(out, coloured, share, there)
-    kept = _share_of_noise(fine, variance, share, there)
+    kept = np.empty((rows, cols), np.float32)
+    for i in range(rows):
+        for j in range(cols):
+            kept[i, j] = fine[i, j] * fine[i, j]
+            there[i, j] = (
+                out[0, i, j] * out[0, i, j] + out[1, i, j] * out[1, i, j] + out[2, i, j] * out[2, i, j]
+            )
+    _over_noise(kept, variance, share)
+    _over_noise(there, coloured, share)
+    for i in range(rows):
+        for j in range(cols):
+            t = min(max((kept[i, j] - _NOISE) / (_DETAIL - _NOISE), ZERO), ONE)
+            kept[i, j] = ONE - t * t * (np.float32(3.0) - t - t)  # 0 where the power of detail is in it
+            q = max(ONE - _COLOURED / max(there[i, j], np.float32(1e-20)), ZERO)
+            for c in range(channels):
+                out[c, i, j] *= q
     for i in range(rows):
         for j in range(cols):
             within = _GRAIN * np.sqrt(variance[i, j])
@@ -222,38 +236,10 @@ def _coarse(left: Real, known: Mask, light: Real, weights: Real, chroma: Real, l
 
 
 @jit
-def _without_noise(chroma: Real, noise: Real, power: Real, work: Real) -> None:
-    """Lower chroma as far as noise explains its power nearby, in place."""
-    channels, rows, cols = chroma.shape
-    for i in range(rows):
-        for j in range(cols):
-            square = ZERO
-            for c in range(channels):
-                square += chroma[c, i, j] * chroma[c, i, j]
-            work[i, j] = square
-    smooth(work, _AROUND, power, wrapped=False)
-    smooth(noise, _AROUND, work, wrapped=False)
-    for i in range(rows):
-        for j in range(cols):
-            share = max(ONE - _COLOURED * work[i, j] / max(power[i, j], np.float32(1e-20)), ZERO)
-            for c in range(channels):
-                chroma[c, i, j] *= share
-
-
-@jit
-def _share_of_noise(fine: Real, variance: Real, power: Real, work: Real) -> Real:
-    """1 where the power of `fine` nearby is that of noise, 0 where it is that of detail."""
-    rows, cols = fine.shape
-    kept = np.empty((rows, cols), np.float32)
-    for i in range(rows):
-        for j in range(cols):
-            work[i, j] = fine[i, j] * fine[i, j]
-    smooth(work, _AROUND, power, wrapped=False)
-    smooth(variance, _AROUND, work, wrapped=False)
-    span: Number = ONE / (_DETAIL - _NOISE)
-    for i in range(rows):
-        for j in range(cols):
-            ratio = power[i, j] / max(work[i, j], np.float32(1e-20))
-            t = min(max((ratio - _NOISE) * span, ZERO), ONE)
-            kept[i, j] = ONE - t * t * (np.float32(3.0) - t - t)
-    return kept
+def _over_noise(power: Real, noise: Real, work: Real) -> None:
+    """Turn power into that nearby over the noise nearby, in place."""
+    smooth(power, _AROUND, work, wrapped=False)
+    smooth(noise, _AROUND, power, wrapped=False)
+    for i in range(power.shape[0]):
+        for j in range(power.shape[1]):
+            power[i, j] = work[i, j] / max(power[i, j], np.float32(1e-20))

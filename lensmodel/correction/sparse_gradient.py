@@ -38,9 +38,7 @@ from lensmodel.correction.expected_gain import prior, wiener_spectrum
 from lensmodel.correction.mosaic import refill, spread_grain
 from lensmodel.correction.richardson_lucy import Lights, fill_canvas
 
-_DEGREE: Final = (
-    9  # of the polynomial: a shorter one misses the bend at the jump, each term costs a step (chosen)
-)
+_DEGREE: Final = 9  # of the polynomial: a shorter one misses the bend at the jump (chosen)
 _LARGEST: Final = 24.0  # argument, in widths of the shrinkage: beyond, hardly anything is taken off (chosen)
 _REACH: Final = np.float32(1.0 / _LARGEST)
 _RAMP: Final = 0.1
@@ -48,69 +46,50 @@ _RAMP: Final = 0.1
 
 
 Prox = tuple[Number, Number, Real]
+"""1 / v where the answer of `shrinkage` begins to rise, slope of the ramp that begins there per 1 / v, and
+coefficients of p, highest power first."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Shrinkage:
+@lru_cache(maxsize=16)  # one fit per exponent, not one per tile
+def shrinkage(alpha: float) -> Prox:
     """The minimiser of t |w|^alpha + (w - v)² / 2, by one polynomial for all t.
 
     With s = t^(1 / (2 - alpha)) the substitution w = s u leaves t = 1::
 
         prox_t(v) = s prox_1(v / s),      prox_1(v) = v - p(1 / v)  beyond the jump, else 0
 
-    What is subtracted from v is smooth in 1 / v, so a short polynomial p suffices: unlike a table it
-    runs in vector registers. Beyond 24 s the subtraction is held constant.
+    What is subtracted from v is smooth in 1 / v, so a short polynomial p, fitted to the answers of Newton
+    steps, suffices: unlike a table it runs in vector registers. Beyond 24 s the subtraction is held constant.
     """
-
-    alpha: float  # exponent of the hyper-Laplacian in (0, 1]; 1 is soft thresholding
-    # 1 / v for t = 1 where the answer begins to rise, slope of the ramp that begins there per 1 / v, and
-    # coefficients of p, highest power first
-    prox: Prox
-
-    @classmethod
-    @lru_cache(maxsize=16)  # one fit per exponent, not one per tile
-    def of(cls, alpha: float) -> Shrinkage:
-        """Fit the polynomial to the answers found by Newton steps."""
-        if not 0.0 < alpha <= 1.0:
-            raise InvalidInputError(f"alpha must lie in (0, 1], got {alpha}")
-        # Where the energies of w = 0 and of the other minimum are equal the answer jumps.
-        jump_w = (2.0 * (1.0 - alpha)) ** (1.0 / (2.0 - alpha))
-        jump = jump_w + alpha * jump_w ** (alpha - 1.0) if alpha < 1.0 else 1.0
-        low, high = 1.0 / _LARGEST, 1.0 / jump
-        nodes = np.cos(np.pi * (np.arange(400) + 0.5) / 400)
-        inverse = low + (high - low) * (nodes + 1.0) / 2.0
-        v = 1.0 / inverse
-        w = v.copy()
-        for _ in range(40):
-            slope = alpha * w ** (alpha - 1.0) + w - v
-            bend = alpha * (alpha - 1.0) * w ** (alpha - 2.0) + 1.0
-            w = np.clip(w - slope / np.where(np.abs(bend) < 1e-3, 1e-3, bend), max(jump_w, 1e-9), v)
-        terms = np.polynomial.Polynomial.fit(inverse, v - w, _DEGREE).convert().coef[::-1]
-        steepness = jump / (1.0 - 1.0 / (1.0 + _RAMP))
-        return cls(alpha, (np.float32(1.0 / jump), np.float32(steepness), terms.astype(np.float32)))
-
-    def scale(self, threshold: Real) -> Real:
-        """The scale s for a threshold t."""
-        return np.asarray(np.power(threshold, 1.0 / (2.0 - self.alpha)), dtype=np.float32)
+    if not 0.0 < alpha <= 1.0:
+        raise InvalidInputError(f"alpha must lie in (0, 1], got {alpha}")
+    # Where the energies of w = 0 and of the other minimum are equal the answer jumps.
+    jump_w = (2.0 * (1.0 - alpha)) ** (1.0 / (2.0 - alpha))
+    jump = jump_w + alpha * jump_w ** (alpha - 1.0) if alpha < 1.0 else 1.0
+    low, high = 1.0 / _LARGEST, 1.0 / jump
+    nodes = np.cos(np.pi * (np.arange(400) + 0.5) / 400)
+    inverse = low + (high - low) * (nodes + 1.0) / 2.0
+    v = 1.0 / inverse
+    w = v.copy()
+    for _ in range(40):
+        slope = alpha * w ** (alpha - 1.0) + w - v
+        bend = alpha * (alpha - 1.0) * w ** (alpha - 2.0) + 1.0
+        w = np.clip(w - slope / np.where(np.abs(bend) < 1e-3, 1e-3, bend), max(jump_w, 1e-9), v)
+    terms = np.polynomial.Polynomial.fit(inverse, v - w, _DEGREE).convert().coef[::-1]
+    steepness = jump / (1.0 - 1.0 / (1.0 + _RAMP))
+    return np.float32(1.0 / jump), np.float32(steepness), terms.astype(np.float32)
 
 
 @jit
 def shrink(v: Number, scale: Number, prox: Prox) -> Number:
-    """Shrink one gradient; see `Shrinkage`."""
+    """Shrink one gradient by s = `scale`; see `shrinkage`."""
     edge, steepness, terms = prox
     size = max(abs(v), np.float32(1e-20))
     below = scale / size
     inverse = min(max(below, _REACH), edge)
-    subtracted = terms[0]
-    subtracted = subtracted * inverse + terms[1]
-    subtracted = subtracted * inverse + terms[2]
-    subtracted = subtracted * inverse + terms[3]
-    subtracted = subtracted * inverse + terms[4]
-    subtracted = subtracted * inverse + terms[5]
-    subtracted = subtracted * inverse + terms[6]
-    subtracted = subtracted * inverse + terms[7]
-    subtracted = subtracted * inverse + terms[8]
-    subtracted = subtracted * inverse + terms[9]
+    subtracted = ZERO
+    for k in range(_DEGREE + 1):
+        subtracted = subtracted * inverse + terms[k]
     kept = (size - scale * subtracted) * min(max((edge - below) * steepness, ZERO), ONE)
     return kept if v >= ZERO else -kept
 
@@ -364,7 +343,7 @@ class SparseGradient:
         level = np.maximum(mean, _DARK)
         local = _local_means(luma * luma) - mean * mean
         relative = (var / noise[:, None, None]).mean(axis=0)
-        shrinkage = Shrinkage.of(self.alpha)
+        power = np.float32(1.0 / (2.0 - self.alpha))  # of a threshold, for the scale of `shrinkage`
         calm = _calm(local, level, var.mean(axis=0) / len(blurred), self.alpha)
         threshold = relative * calm / level ** np.float32(self.alpha)
         couplings = self.coupling * self.growth ** np.arange(self.steps)
@@ -374,7 +353,7 @@ class SparseGradient:
         weights = np.full(len(blurred), self.mosaic_weight if mosaic else self.weight, dtype=np.float64)
         if not mosaic and glow is None:
             # beside removed lights the rest is no natural scene: the prior keeps its weight
-            weights *= _reliance(_determined_share(K[1], canvas.shape, noise[1], variance[1]))
+            weights *= _reliance(K[1], canvas.shape, noise[1], variance[1])
         weights[1:] *= self.chroma
         y = fill_canvas(canvas, blurred, light, K, blurs, sensors, _LIGHT_STEPS)
         if mosaic:
@@ -388,13 +367,12 @@ class SparseGradient:
             start,
             _gradient_power(canvas.shape),
             canvas.filled(
-                interpolated(shrinkage.scale(threshold), BLOCK, canvas.rows, canvas.cols)[None],
-                np.ones(1, np.float32),
+                interpolated(threshold**power, BLOCK, canvas.rows, canvas.cols)[None], np.ones(1, np.float32)
             )[0],
-            shrinkage.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
+            (weights[None, :] / couplings[:, None]).astype(np.float32) ** power,
             couplings.astype(np.float32),
             _OPPONENT,
-            shrinkage.prox,
+            shrinkage(self.alpha),
             (rates, *_from_middle(canvas, blurs[0])),
         )
 
@@ -409,13 +387,13 @@ def _from_middle(canvas: Canvas, blur: UniformBlur) -> tuple[Real, Real]:
     return down, across
 
 
-def _determined_share(
-    K: NDArray[np.complex64], shape: tuple[int, int], noise: np.float32, variance: np.float32
-) -> float:
-    """Share of the power of a natural scene's gradients that the data determine: sum |F|² S W / sum |F|² S.
+def _reliance(K: Complex, shape: tuple[int, int], noise: np.float32, variance: np.float32) -> float:
+    """Factor on kappa by the share of a natural scene's gradients that the data determine.
 
-    S is the scene's spectrum (in a flat cell, that of an average scene), and
-    W = |K|² S / (|K|² S + noise) the share of it that Wiener's filter keeps.
+    The most probable picture is not the mean of the probable ones: gradients that the data leave open all
+    come out as zero, so where the blur is wide and the noise strong the prior must weigh less. The share is
+    sum |F|² S W / sum |F|² S, with S the scene's spectrum (in a flat cell, that of an average scene) and
+    W = |K|² S / (|K|² S + noise) the part of it that Wiener's filter keeps.
     """
     prior_power = prior(shape)[1]
     blurred_prior = prior_power * (K.real**2 + K.imag**2)
@@ -424,16 +402,8 @@ def _determined_share(
         float(noise) * float(blurred_prior.sum(dtype=np.float64)) / (signal * shape[0] * shape[1])
     )
     gradients = prior_power * _gradient_power(shape)
-    return float((gradients * (blurred_prior / (blurred_prior + level))).sum() / gradients.sum())
-
-
-def _reliance(share: float) -> float:
-    """Factor on kappa where the data determine this share of the gradients.
-
-    The most probable picture is not the mean of the probable ones: gradients that the data leave open
-    all come out as zero, so where the blur is wide and the noise strong the prior must weigh less.
-    """
-    return float(np.clip(_OPEN + _SLOPE * share, _LEAST, 1.0))
+    share = float((gradients * (blurred_prior / (blurred_prior + level))).sum() / gradients.sum())
+    return min(max(_OPEN + _SLOPE * share, _LEAST), 1.0)
 
 
 def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:

@@ -22,7 +22,7 @@ from lensmodel.correction import (
 )
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.richardson_lucy import Lights
-from lensmodel.correction.sparse_gradient import Shrinkage, shrink
+from lensmodel.correction.sparse_gradient import shrink, shrinkage
 
 CLEAN = Sensor(NoiseModel(1e-7, 1e-8))
 METHODS = list(deconvolvers)
@@ -260,18 +260,17 @@ def test_clipped_lights_do_not_ring_into_their_neighbours() -> None:
 @pytest.mark.parametrize("alpha", [0.5, 0.8, 1.0])
 @pytest.mark.parametrize("threshold", [1e-4, 0.01, 1.0])
 def test_shrinkage_finds_the_minimum_but_on_the_ramp_of_its_jump(alpha: float, threshold: float) -> None:
-    shrinkage = Shrinkage.of(alpha)
-    scale = shrinkage.scale(np.float32(threshold))
+    prox, scale = shrinkage(alpha), np.float32(threshold ** (1.0 / (2.0 - alpha)))
     v = np.linspace(-4.0, 4.0, 41).astype(np.float32)
     grid = np.linspace(-4.2, 4.2, 20001)
 
-    found = np.array([shrink(value, scale, shrinkage.prox) for value in v])
+    found = np.array([shrink(value, scale, prox) for value in v])
 
     def energy(w: np.ndarray) -> np.ndarray:
         return threshold * np.abs(w) ** alpha + (w - v[:, None]) ** 2 / 2
 
     best = energy(np.tile(grid, (v.size, 1))).min(axis=1)
-    jump = np.abs(v) * shrinkage.prox[0] / scale
+    jump = np.abs(v) * prox[0] / scale
     excess = energy(found[:, None].astype(np.float64))[:, 0] - best - 2e-3 * threshold - 1e-5
     assert np.all(excess[(jump <= 1.0) | (jump >= 1.1)] <= 0.0)
 

@@ -445,7 +445,6 @@ class PsfOut(Model):
     query: PsfQuery = Field(description="the question as it was understood")
     psf: KernelOut
     support: Support
-    bandwidth: dict[str, float]
     units: Units
 
 

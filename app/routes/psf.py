@@ -89,7 +89,6 @@ def get_psf_as(lens_id: str, suffix: Format, call: CallDep) -> Response:
         query=at.model_copy(update={"phi": once_round}),
         psf=KernelOut(shape=(at.size, at.size), dtype="float32", data=[]),
         support=Support.of(answer),
-        bandwidth=fitted.model.bandwidth,
         units=Units(pixel_pitch_um=at.pixel_pitch_um or fitted.model.pitch_um),
     )
     body, more = encoded(suffix, answer.kernel, told)

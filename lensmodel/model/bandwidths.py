@@ -20,25 +20,18 @@ psi is Tukey's biweight; a sample that fits better than the median keeps its wei
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM
-from lensmodel.model import query
 from lensmodel.model.query import PAPER
 
-FALLBACK: Final[Mapping[str, float]] = {
-    "aperture_stops": 0.5,
-    "wavelength_nm": 20.0,  # red and green differ by 70 nm: 0.2 percent of each other's weight
-    "focal_octaves": 0.25,
-    "focus_dioptres": 0.5,
-}
-"""Bandwidths of settings that do not vary among the samples, and upper limits of those that do."""
-
+# In the columns of `query.point`, bandwidths of settings that do not vary among the samples, and upper limits
+# of those that do; with 20 nm, red and green, 70 nm apart, have 0.2 percent of each other's weight
+_FALLBACK = np.array([math.nan, math.nan, math.nan, 0.5, 20.0, 0.25, 0.5])
 _FLOOR_R, _FLOOR_PHI = 0.02, 0.12  # least bandwidths: blur does not change faster over the field (chosen)
 _SAME = 1e-6  # equal values have a spread of rounding errors, not of zero
 _PLACE_SHARE = 0.45  # of eq. 8: the rule is for densities, a smooth regression wants less
@@ -66,16 +59,15 @@ def reference_bandwidth(sigma: float, dimensions: int, count: int) -> float:
 
 def bandwidths(
     where: NDArray[np.float64], mode: str, factors: tuple[float, float] = (1.0, 1.0)
-) -> dict[str, float]:
-    """Bandwidths of points `(n, 7)` by eq. (8), and factors on r and phi.
+) -> NDArray[np.float64]:
+    """Bandwidths of the columns of points `(n, 7)` by eq. (8), and factors on r and phi.
 
     n counts PSF samples of one channel, not their pixels: a million pixels of one PSF say nothing
     about another place. d counts the place and those settings that vary. (u, v) have none.
     """
     n = int(np.unique(where[:, 4], return_counts=True)[1].max())
     known = {column: where[~np.isnan(where[:, column]), column] for column in (3, 5, 6)}
-    spread = {query.COLUMNS[c]: float(values.std()) if values.size else 0.0 for c, values in known.items()}
-    varying = {name: sigma for name, sigma in spread.items() if sigma > _SAME}
+    varying = {c: float(values.std()) for c, values in known.items() if values.size and values.std() > _SAME}
     d = 2 + len(varying)
     # the paper's own way is eq. (8) as it stands
     whole = _PLACE_SHARE if mode == PAPER else 1.0
@@ -83,8 +75,11 @@ def bandwidths(
         max(_PLACE_SHARE * reference_bandwidth(sigma, d, n), floor) / whole
         for sigma, floor in ((float(where[:, 0].std()), _FLOOR_R), (math.sqrt(0.5), _FLOOR_PHI))
     )
-    rule = {name: min(FALLBACK[name], reference_bandwidth(sigma, d, n)) for name, sigma in varying.items()}
-    return {"r": r * factors[0], "phi": phi * factors[1], **FALLBACK, **rule}
+    scale = _FALLBACK.copy()
+    scale[0], scale[1:3] = r * factors[0], phi * factors[1]
+    for column, sigma in varying.items():
+        scale[column] = min(scale[column], reference_bandwidth(sigma, d, n))
+    return scale
 
 
 class HeldOut:
@@ -195,7 +190,7 @@ def cross_validate(
     """
     paper = mode == PAPER
     photo = np.unique([s.photo for s in samples], return_inverse=True)[1]
-    groups, scale = _held_together(photo, where[:, 5]), query.scales(bandwidths(where, mode))
+    groups, scale = _held_together(photo, where[:, 5]), bandwidths(where, mode)
     counting = np.flatnonzero(base > 0)
     scored = _thinned(counting, _SCORED)
     errors, noise = np.full(len(samples), _UNKNOWN_ERROR), np.zeros(len(samples))

@@ -135,11 +135,6 @@ class LensModel:
         """Pixel pitch that answers are for unless another is asked for; None where no sample knows."""
         return camera_bodies.usual_pitch(self.samples)
 
-    @property
-    def bandwidth(self) -> dict[str, float]:
-        """Bandwidths of the regression in use, by variable; empty without one."""
-        return {} if self._regression is None else self._regression.bandwidth
-
     def coverage(self) -> dict[Zone, int]:
         """Number of green samples in each zone."""
         zones = [zone_of(s.position.r) for s in self.samples if s.settings.channel == "g"]

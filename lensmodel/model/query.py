@@ -21,7 +21,7 @@ A setting that is unknown, in the question or in the sample, drops out of both s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -30,9 +30,6 @@ from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, Kernel, LensSettings
-
-COLUMNS: Final = ("r", "phi", "phi", "aperture_stops", "wavelength_nm", "focal_octaves", "focus_dioptres")
-"""The variable that each column of a point belongs to; phi takes two, cosine and sine."""
 
 # in which a question can lie beyond the samples
 VARIABLES: Final = ("place", "aperture_stops", "focal_octaves", "focus_dioptres")
@@ -53,7 +50,10 @@ def _numbers(settings: LensSettings) -> tuple[float, float, float]:
 
 
 def point(position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:
-    """Coordinates of a place and settings, shape (7,), in the order of `COLUMNS`; NaN = unknown."""
+    """Coordinates of a place and settings, shape (7,); NaN = unknown.
+
+    They are r, phi as cosine and sine, stops, wavelength in nm, octaves of focal length, dioptres.
+    """
     share = min(position.r / _CENTER_R, 1.0)
     stops, octaves, dioptres = _numbers(settings)
     turned = share * math.cos(position.phi), share * math.sin(position.phi)
@@ -69,11 +69,6 @@ def vectors(where: NDArray[np.float64]) -> NDArray[np.float64]:
     """(x, y) to the right and up, in half-diagonals, of points `(n, 7)`, shape (n, 2)."""
     r = where[:, :1]
     return np.asarray(where[:, 1:3] * (r / np.minimum(np.maximum(r, 1e-30) / _CENTER_R, 1.0)))
-
-
-def scales(widths: Mapping[str, float]) -> NDArray[np.float64]:
-    """Bandwidths in the order of `COLUMNS`, shape (7,)."""
-    return np.array([widths[name] for name in COLUMNS])
 
 
 def squared_distances(

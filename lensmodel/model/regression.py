@@ -128,8 +128,7 @@ class Regression:
         # what the estimators expect of their samples; 0 where they expect nothing
         self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
         self._photos = np.array([s.photo for s in samples], dtype=object)
-        self.bandwidth = bandwidths(points, mode, factors)
-        self._around = Neighbourhood(points, weights, query.scales(self.bandwidth))
+        self._around = Neighbourhood(points, weights, bandwidths(points, mode, factors))
 
     def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:
         """Answer at a place, in pixels of some pitch."""

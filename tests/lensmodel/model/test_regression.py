@@ -17,6 +17,7 @@ from lensmodel.core.psf import PsfSample, centroid, delta, second_moments
 from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel
 from lensmodel.model import query as va
+from lensmodel.model.bandwidths import bandwidths
 from lensmodel.model.query import MODES
 from lensmodel.model.regression import (
     Answers,
@@ -197,8 +198,8 @@ def all_pairs(model: LensModel, position: FieldPosition, *, pixel: float) -> np.
     """Answer with the sum over all pixels of all samples, eq. 4 to 7; a PSF is zero outside its support."""
     t = np.arange(SIZE, dtype=np.float64) - SIZE // 2
     u, v = (a.ravel() for a in pixel_to_local(t[:, None], t[None, :], position.phi))
-    scale = va.scales(model.bandwidth)
-    squared = va.squared_distances(va.points(model.samples), va.point(position, GREEN), scale)
+    known = va.points(model.samples)
+    squared = va.squared_distances(known, va.point(position, GREEN), bandwidths(known, "paper"))
     above, below = np.zeros(u.size), np.zeros(u.size)
     for sample, weight in zip(model.samples, np.exp(-0.5 * squared), strict=True):
         kernel = np.pad(sample.kernel, 4)
@@ -223,10 +224,10 @@ def test_answer_is_within_eight_hundredths_of_the_exact_sum() -> None:
 def test_bandwidths_are_those_of_green_in_whatever_order_channels_come() -> None:
     green = photos(3, noise=0.01)
     blue = [replace(s, settings=s.settings.with_channel("b")) for s in photos(3, noise=0.5)]
-    of_green = LensModel.fit(green, "paper").bandwidth
+    of_green = bandwidths(va.points(green), "paper")
 
     for samples in ([*green, *blue], [*blue, *green]):
-        assert LensModel.fit(samples, "paper").bandwidth == of_green
+        assert np.array_equal(bandwidths(va.points(samples), "paper"), of_green)
 
 
 # ---- families

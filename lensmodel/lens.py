@@ -199,14 +199,9 @@ class Lens:
             Tangential (contrast along the radius), then sagittal; 1 at frequency 0.
         """
         wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
-        if wanted.ndim != 1:
+        if wanted.ndim != 1 or not (np.isfinite(wanted) & (wanted >= 0.0)).all():
             raise InvalidInputError(
-                f"frequencies must have the shape (n,), got {wanted.shape}; give a flat list"
-            )
-        wrong = wanted[~(np.isfinite(wanted) & (wanted >= 0.0))]
-        if wrong.size:
-            raise InvalidInputError(
-                f"frequencies must be finite and not negative, cycles/pixel, got {wrong[0]:g}; leave it out"
+                f"frequencies must be a flat list of cycles/pixel, finite and not negative, got {frequencies}"
             )
         kernels = self.kernels(r, phi, **settings)
         return _both_ways(kernels, phi, lambda kernel, angle: mtf_from_kernel(kernel, angle, wanted))

@@ -77,13 +77,6 @@ class Centring:
     softer: Asymmetry | None = None
     coma: Asymmetry | None = None  # towards the tail of the blur in the middle of the picture; amount = |m0|
 
-    @property
-    def side(self) -> str:
-        """The softer side in words where that is sure, else empty."""
-        if self.softer is None or not self.softer.significant or self.softer.amount <= _SOFTER:
-            return ""
-        return f"the {direction_in_words(self.softer.direction)}"
-
 
 def centring(model: LensModel, settings: LensSettings) -> Centring:
     """Judge the centring of a copy from the samples of one colour near an aperture."""

@@ -260,7 +260,7 @@ class LensReport:
     def summary(self) -> tuple[str, ...]:
         """The report in sentences, those of its first aperture."""
         first = self.tested[0]
-        lines = [self.verdict, f"{first.centring.text[:1].upper()}{first.centring.text[1:]}."]
+        lines = [self.verdict]
         if first.unknown_share:
             lines.append(
                 f"Too little is known of {first.unknown_share:.0%} of the picture; those figures are guesses."
@@ -431,14 +431,7 @@ def _verdict(tested: Sequence[ApertureReport]) -> str:
     best = max(means, key=lambda n: (means[n], -(n or 0.0)), default=None)
     if len(means) > 1 and best != found.settings.aperture:
         words.append(f"It is sharpest over the whole picture at f/{best:g}.")
-    side, tails = found.centring.side, "points in the middle of the picture have tails"
-    words.append(
-        {
-            "centred": "It is well centred.",
-            "decentred": f"It is decentred: {side + ' is softer than the opposite side' if side else tails}.",
-            "unknown": "It is not yet possible to say whether it is centred.",
-        }[found.centring.verdict]
-    )
+    words.append(f"{found.centring.text[:1].upper()}{found.centring.text[1:]}.")
     if not np.mean([spot.predicted_error for spot in found.map]) < UNKNOWN:
         words.append("Much of this is still a guess; more photos will help.")
     return " ".join(words)

@@ -126,13 +126,9 @@ def test_arrays_that_do_not_fit_each_other_are_refused(change: dict[str, Any]) -
         Lens.from_kernels(**given)
 
 
-@pytest.mark.parametrize(
-    ("frequencies", "text"),
-    [([[0.1, 0.2]], r"\(1, 2\)"), ([0.1, np.nan], "got nan"), ([0.1, -0.2], r"got -0\.2")],
-    ids=str,
-)
-def test_frequencies_that_no_contrast_has_are_refused(frequencies: Any, text: str, lens: Lens) -> None:
-    with pytest.raises(InvalidInputError, match=text):
+@pytest.mark.parametrize("frequencies", [[[0.1, 0.2]], [0.1, np.nan], [0.1, -0.2]], ids=str)
+def test_frequencies_that_no_contrast_has_are_refused(frequencies: Any, lens: Lens) -> None:
+    with pytest.raises(InvalidInputError, match="flat list"):
         lens.mtf(0.5, 0.0, frequencies)
 
 

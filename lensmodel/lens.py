@@ -201,7 +201,7 @@ class Lens:
         wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
         if wanted.ndim != 1 or not (np.isfinite(wanted) & (wanted >= 0.0)).all():
             raise InvalidInputError(
-                f"frequencies must be a flat list of cycles/pixel, finite and not negative, got {frequencies}"
+                f"frequencies must be a flat list of cycles/pixel, finite and not negative, got {wanted}"
             )
         kernels = self.kernels(r, phi, **settings)
         return _both_ways(kernels, phi, lambda kernel, angle: mtf_from_kernel(kernel, angle, wanted))

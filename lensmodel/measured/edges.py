@@ -51,8 +51,8 @@ _LEAST_PX: Final = 0.15  # standard deviation of a Gaussian: narrower looks the 
 # Pixels around a corner that are compared: standard deviations, within limits (chosen)
 _HALF_WIDTHS, _LEAST_HALF, _MOST_HALF = 3.0, 6, 20
 _SPARE_PX: Final = 16  # around them, which the blur of the rim of what is drawn reaches (chosen)
-# Where the fit begins: widths of the core and of the wider Gaussian over that of the square, weights of the
-# latter and of the halo over that of the core, and the halo's width. And a weak prior around it: standard
+# Where the fit begins, round: widths of the core and of the wider Gaussian over that of the edges, weights of
+# the latter and of the halo over that of the core, and the halo's width. And a weak prior around it: standard
 # deviations of the logarithms, of the factors' lower corners, and of the two means in pixels (chosen)
 _CORE, _WIDE, _START_WEIGHTS, _HALO_PX = 0.75, 1.7, (0.37, 0.05), 3.5
 _SPREAD: Final = np.array([1.0] * 6 + [0.5] * 4 + [1.5, 1.5, 0.4])
@@ -257,7 +257,9 @@ def _square_psf(photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge
         slices = [part / _SLICE_ERROR for wave in waves for part in (wave.real, wave.imag)]
         return np.concatenate([*slices, *(corner(vector) for corner in corners)])
 
-    start = min(_starts(lines), key=lambda vector: float(np.square(misfit(vector)).sum()))
+    width = math.sqrt(float(np.mean([line.variance for line in lines])))
+    shapes = [(math.log(share * width), 0.0, math.log(share * width)) for share in (_CORE, _WIDE)]
+    start = np.concatenate([*shapes, [0.0] * 4, np.log(_START_WEIGHTS), [math.log(_HALO_PX)]])
     low = np.full(start.size, -np.inf)
     low[[0, 2, 3, 5]] = math.log(_LEAST_PX)
     start = np.maximum(start, low + 1e-3)
@@ -266,22 +268,3 @@ def _square_psf(photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge
         start, bounds=(low, np.inf), x_scale=_SPREAD, max_nfev=_STEPS, ftol=1e-7,
     )  # fmt: skip
     return Found(_kernel(result.x, size), 0.0, np.mean([edge.middle for edge in square], axis=0))
-
-
-def _starts(lines: Sequence[_Line]) -> list[NDArray[np.float64]]:
-    """Parameters whose widths along two axes are those of the edges, and correlations from -.9 to .9."""
-    n = lines[0].normal
-    m = np.array([-n[1], n[0]])
-    first, second = (
-        float(np.mean([line.variance for line in lines if (abs(line.normal @ n) > math.sqrt(0.5)) == along]))
-        for along in (True, False)
-    )
-    both = math.sqrt(first * second) * (np.outer(n, m) + np.outer(m, n))
-    ellipse = first * np.outer(n, n) + second * np.outer(m, m)
-    starts = []
-    for share in np.linspace(-0.9, 0.9, 7):
-        (down, _), (lower, across) = np.linalg.cholesky(ellipse + share * both)
-        shapes = [(math.log(s * down), s * lower, math.log(s * across)) for s in (_CORE, _WIDE)]
-        rest = [0.0] * 4, np.log(_START_WEIGHTS), [math.log(_HALO_PX)]
-        starts.append(np.concatenate([*shapes, *rest]))
-    return starts

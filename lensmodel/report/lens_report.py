@@ -54,7 +54,7 @@ _ROUND: Final = 1.05  # of the hull of measured places, which a figure may lie b
 # Shares of the centre's MTF50 above which a place is called as sharp, nearly as sharp, and clearly softer
 # (chosen: a fifth less is hardly seen in a print, half as much at a glance)
 _EVEN: Final = 0.95
-_FALLS: Final = ((0.8, "nearly as sharp"), (0.5, "clearly softer"), (0.0, "much softer"))
+_FALLS: Final = ((_EVEN, "as sharp"), (0.8, "nearly as sharp"), (0.5, "clearly softer"), (0.0, "much softer"))
 # MTF50 in cycles/pixel of the centre, and what it is called (chosen: an ideal pixel behind an ideal lens
 # reaches .6, a demosaiced photo about .3)
 _LEVELS: Final = ((0.35, "very sharp"), (0.2, "sharp"), (0.1, "a little soft"), (0.0, "soft"))
@@ -440,21 +440,17 @@ def _verdict(tested: Sequence[ApertureReport]) -> str:
 def sharpness(found: ApertureReport) -> str:
     """Say in one sentence how sharp a copy is in the centre and in its worst corner."""
     center, worst = found.spots[0].mean, found.worst
-    figure = SensorGeometry().words(center, "c/px", found.spots[0].mean_range)
     level = next(words for least, words in _LEVELS if center >= least)
+    figure = SensorGeometry().words(center, "c/px", found.spots[0].mean_range)
     words = f"this copy is {level} in the centre (MTF50 {figure} cycles/pixel)"
     share = worst.mean / max(center, 1e-6)
+    how = next(words for least, words in _FALLS if share >= least)
     # surely softer only where even the top of its range lies below the middle of the centre's
-    sure = not worst.unknown and worst.mean_range[1] < center
-    if share >= _EVEN:
-        fall = f"its corners {'seem' if worst.unknown else 'are'} just as sharp"
-    else:
-        how = next(words for least, words in _FALLS if share >= least)
-        fall = f"its worst corner, the {worst.side}, {'is' if sure else 'seems'} {how} ({worst.words})"
-    if worst.unknown:
-        fall += ", but too little is known there"
+    sure = not worst.unknown and (share >= _EVEN or worst.mean_range[1] < center)
+    fall = f"its worst corner, the {worst.side}, {'is' if sure else 'seems'} {how} ({worst.words})"
+    unknown = ", but too little is known there" if worst.unknown else ""
     begin = f"At {found.at} {words}" if found.at else f"{words[0].upper()}{words[1:]}"
-    return f"{begin}, and {fall}."
+    return f"{begin}, and {fall}{unknown}."
 
 
 def widest(model: LensModel) -> LensSettings:

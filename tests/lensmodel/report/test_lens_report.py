@@ -187,7 +187,7 @@ def test_the_verdict_names_the_worst_corner_and_does_not_contradict_the_map() ->
     assert found.tested[0].worst.place in {"the upper right corner", "the lower right corner"}
     assert re.search(r"worst corner, the (upper|lower) right, is (much|clearly) softer", found.verdict)
     assert "the right is softer than the opposite side" in found.verdict
-    assert "its corners are just as sharp" in report_of(corner=0.8).verdict
+    assert re.search(r"worst corner, .*, is as sharp \(T", report_of(corner=0.8).verdict)
 
 
 @pytest.mark.parametrize("corner", [0.8, 2.0])
@@ -199,7 +199,7 @@ def test_the_verdict_is_as_sure_of_the_corners_as_the_map(corner: float) -> None
     )
 
     assert re.search(r"seems? .*, but too little is known there\.$", sharpness(unknown))
-    assert re.search(r"(is|are) (just as|nearly as|clearly|much) ", sharpness(known))
+    assert re.search(r"(is|seems) (as|nearly as|clearly|much) ", sharpness(known))
     assert "little is known" not in sharpness(known)
     assert [spot.unknown for spot in found.spots] == [spot.predicted_error >= UNKNOWN for spot in found.spots]
 

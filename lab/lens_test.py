@@ -171,7 +171,7 @@ def by_photos(lens: GridLens, photos: int, pitch_um: float) -> list[Sharpness]:
         for number, path in enumerate(shots):
             known.shot(number, path)
         model = calibrate(shots, aperture=known.settings.aperture).model
-    found = lens_report(model, "", channels=("g",)).tested[0]
+    found = lens_report(model, "").tested[0]
     return [
         Sharpness(s.position, s.tangential, s.sagittal, (s.tangential_range, s.sagittal_range), s.unknown)
         for s in found.map

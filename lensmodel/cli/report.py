@@ -61,7 +61,7 @@ def report(
     shown, targets = Display(), _targets(output)
     files.refuse_existing(*targets, force=force)
     with shown.progress("computing its PSFs at 200 places"):
-        found = measured(profile, aperture, whole=output is not None)
+        found = measured(profile, aperture)
     if output is not None:
         with shown.progress("drawing"):
             for target in targets:
@@ -72,8 +72,8 @@ def report(
     shown.result("\n".join([*lines, *([] if output is None else [f"written: {output}"])]))
 
 
-def measured(profile: Path, aperture: float | None, *, whole: bool) -> LensReport:
-    """Report on the lens of a profile: whole, in all colours, or only what the screen shows."""
+def measured(profile: Path, aperture: float | None) -> LensReport:
+    """Report on the lens of a profile."""
     known = files.profile_at(profile)
     with files.as_usage():
         asked = None if aperture is None else [LensSettings(aperture=aperture).aperture or aperture]
@@ -81,7 +81,6 @@ def measured(profile: Path, aperture: float | None, *, whole: bool) -> LensRepor
             known.model,
             name_of(known.lens) or profile.stem,
             apertures=asked,
-            channels=("g", "r", "b") if whole else ("g",),
             details=provenance(
                 known.lens.get("serial"),
                 [camera_name(camera.maker, camera.model) for camera in known.cameras],

@@ -152,7 +152,7 @@ def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
     words, units = report.sensor.words, report.sensor.units
     head = ["Aperture", "Place", *(f"{side}, {UNIT_NAMES[unit]}" for unit in units for side in "TS")]
     rows = []
-    for found in report.green:
+    for found in report.tested:
         for spot in (found.spots[0], *found.sides, *found.spots[1:]):
             place = spot.place.removeprefix("the ") + (" (not known)" if spot.unknown else "")
             figures = [words(value, unit, between) for unit in units for _, value, between in spot.directions]
@@ -171,7 +171,7 @@ def to_csv(report: LensReport) -> str:
 
 
 def _rows(found: ApertureReport) -> Iterator[_Row]:
-    """What was found at one aperture in one colour, as figures with what is known of each.
+    """What was found at one aperture, as figures with what is known of each.
 
     Centring is the verdict as 0 or 1, and both signs of a fault with two standard errors and their direction.
     """

@@ -22,7 +22,6 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import places_of
 from lensmodel.core.types import (
     ZONES,
-    Channel,
     FieldPosition,
     LensSettings,
     StepHook,
@@ -167,7 +166,7 @@ class Spot:
 
 @dataclass(frozen=True, slots=True)
 class ApertureReport:
-    """What was found at one aperture, in one colour."""
+    """What was found at one aperture, in green."""
 
     settings: LensSettings
     aspect: float  # width over height of the map
@@ -211,24 +210,19 @@ class LensReport:
     photos: int  # that it rests on
     places: int  # at which these show the blur, in the colour that most of them show
     sensor: SensorGeometry  # for other units than cycles/pixel
-    tested: tuple[ApertureReport, ...]  # by aperture, ascending, and by colour, green first
+    tested: tuple[ApertureReport, ...]  # by aperture, ascending
     # what else stands on the page: camera, serial, names of photos
     details: Mapping[str, str] = field(default_factory=dict)
     measured: bool = False  # whether photos of charts, targets or points alone tell of the lens
 
-    @property
-    def green(self) -> tuple[ApertureReport, ...]:
-        """What was found in green, in which a lens is judged."""
-        return tuple(one for one in self.tested if one.settings.channel == "g")
-
     def at(self, aperture: float | None) -> ApertureReport:
-        """Return what was found in green at an aperture; at the widest for None or one not tested."""
-        return next((one for one in self.green if one.settings.aperture == aperture), self.green[0])
+        """Return what was found at an aperture; at the widest for None or one not tested."""
+        return next((one for one in self.tested if one.settings.aperture == aperture), self.tested[0])
 
     @property
     def apertures(self) -> tuple[float | None, ...]:
         """Those that were tested."""
-        return tuple(one.settings.aperture for one in self.green)
+        return tuple(one.settings.aperture for one in self.tested)
 
     @property
     def facts(self) -> str:
@@ -246,7 +240,7 @@ class LensReport:
                 "Nothing is known beyond the outermost places that were measured: what you photograph to "
                 "measure, let it fill the frame."
             )
-        spots = [(spot, one) for one in self.green for spot in (*one.spots, *one.sides)]
+        spots = [(spot, one) for one in self.tested for spot in (*one.spots, *one.sides)]
         least, tested = max(spots, key=lambda pair: pair[0].predicted_error)
         if least.predicted_error < _WELL_KNOWN:
             return "The lens is well known by now; another photo would add little."
@@ -301,7 +295,6 @@ def lens_report(
     *,
     aspect: float | None = None,
     height_px: int | None = None,
-    channels: Sequence[Channel] = ("g", "r", "b"),
     apertures: Sequence[float] | None = None,
     rows: int = ROWS,
     size: int = 31,
@@ -319,8 +312,7 @@ def lens_report(
     named = marked_places(aspect).items()
     mapped = [("", at) for at in grid(rows, cols, aspect)]
     numbers = _chosen(model) if apertures is None else apertures
-    wanted = [LensSettings(aperture=n) for n in numbers] or [LensSettings()]
-    questions = [settings.with_channel(channel) for settings in wanted for channel in channels]
+    questions = [LensSettings(aperture=n) for n in numbers] or [LensSettings()]
     pitch = _shared(sample.pixel_pitch_um for sample in model.samples)
     frequencies = _frequencies(pitch)
     tested = []
@@ -426,8 +418,7 @@ def _curves(
 def _verdict(tested: Sequence[ApertureReport]) -> str:
     """Say what a photographer wants to know: centre, worst corner, best aperture, centring."""
     found, words = tested[0], [sharpness(tested[0])]
-    green = [one for one in tested if one.settings.channel == "g"]
-    means = {one.settings.aperture: float(np.mean([spot.mean for spot in one.map])) for one in green}
+    means = {one.settings.aperture: float(np.mean([spot.mean for spot in one.map])) for one in tested}
     best = max(means, key=lambda n: (means[n], -(n or 0.0)), default=None)
     if len(means) > 1 and best != found.settings.aperture:
         words.append(f"It is sharpest over the whole picture at f/{best:g}.")

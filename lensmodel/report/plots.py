@@ -13,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.types import Channel
 from lensmodel.report.lens_report import NYQUIST, ApertureReport, LensReport, Unit
 
 try:
@@ -34,11 +33,6 @@ _SHARPNESS: Final = LinearSegmentedColormap.from_list(
 )
 _BLACK, _GREY = "#191a1c", "#55585d"
 _INKS: Final = ("#0b6e99", "#b45309", "#15803d", "#7e22ce")
-_CHANNELS: Final[dict[Channel, tuple[str, str]]] = {
-    "r": ("red", "#c2410c"),
-    "g": ("green", "#15803d"),
-    "b": ("blue", "#0b6e99"),
-}
 _UNITS: Final[dict[Unit, str]] = {
     "c/px": "cycles/pixel",
     "lp/ph": "line pairs per picture height",
@@ -49,7 +43,7 @@ _LETTERS: Final = 34  # of a legend beside each other (chosen: they fit in what 
 _PAGE: Final = (8.27, 11.69)  # inches: A4
 _LEFT: Final = 0.07  # of the width of a page: where its lines begin (chosen)
 _LETTERS_OF_A_LINE: Final = 1020.0  # over the size in points: of DejaVu Sans, narrower than the page (chosen)
-_A_PAGE: Final = 4  # panels below each other on a page: those of one aperture
+_A_PAGE: Final = 3  # panels below each other on a page: those of one aperture
 _IN_CELL: Final[dict[str, Any]] = {"ha": "center", "va": "center", "fontsize": 7.0}  # figures on a map
 _HATCHED: Final[dict[str, Any]] = {"facecolor": "#f4f4f2", "edgecolor": "#a8a8a2", "hatch": "////", "lw": 0}
 _LUMA: Final = (0.2126, 0.7152, 0.0722)  # of red, green and blue (ITU-R BT.709)
@@ -112,7 +106,7 @@ def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> l
 
 def pages(report: LensReport) -> list[Figure]:
     """Draw what a photographer shows around on one page, and for testers one for each aperture."""
-    panels = [panel for found in report.green for panel in _panels(report, found, "c/px")]
+    panels = [panel for found in report.tested for panel in _panels(report, found, "c/px")]
     panels += _by_aperture(report, "c/px")
     with mpl.rc_context(_STYLE):
         drawn = [_photographer(report)]
@@ -154,7 +148,6 @@ def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel
             f"Contrast from the centre to the corner{at}: sagittal (S) solid, tangential (T) dashed",
             _on(_contrast, found),
         ),
-        (f"Contrast by colour{at}", _on(_colours, report, found.settings.aperture)),
         (f"Centring{at}", _on(_side_softer, found)),
     ]
 
@@ -292,16 +285,6 @@ def _contrast(ax: Axes, found: ApertureReport) -> None:
     _over_the_radius(ax)
 
 
-def _colours(ax: Axes, report: LensReport, aperture: float | None) -> None:
-    """Contrast of red, green and blue over the radius, mean of tangential and sagittal."""
-    for found in (one for one in report.tested if one.settings.aperture == aperture):
-        name, ink = _CHANNELS[found.settings.channel]
-        curve = found.curves[min(1, len(found.curves) - 1)]
-        both = np.mean([curve.tangential, curve.sagittal], axis=0)
-        ax.plot(found.radii, both, color=ink, label=f"{name}, {curve.name}")
-    _over_the_radius(ax)
-
-
 def _side_softer(ax: Axes, found: ApertureReport) -> None:
     """Towards which side the lens is softer, with the circle of two standard errors."""
     ax.grid(visible=False)
@@ -323,7 +306,7 @@ def _side_softer(ax: Axes, found: ApertureReport) -> None:
 
 def _over_apertures(ax: Axes, report: LensReport, unit: Unit) -> None:
     """MTF50 of the centre and of each corner by aperture."""
-    known = [one for one in report.green if one.at]
+    known = [one for one in report.tested if one.at]
     factor = report.sensor.units.get(unit, 1.0)
     for k, spot in enumerate(known[0].spots):
         values = [factor * one.spots[k].mean for one in known]

@@ -70,7 +70,7 @@ def store_report(client: TestClient, lens_id: str) -> None:
     """Write the report of the newest version of a lens, as a worker does."""
     services = services_of(client)
     _, samples = services.store.lenses.samples_of(lens_id)
-    report = lens_report(LensModel.fit(samples), "A lens", rows=5, size=15, channels=("g",))
+    report = lens_report(LensModel.fit(samples), "A lens", rows=5, size=15)
     lens = services.store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None
     key = report_key(lens_id, lens.version, lens.rebuild_epoch)

@@ -17,8 +17,7 @@ of
 
 over all k >= 0 whose sum is that of the minimum over all k, where q >= 1 is the mean of the squared residuals
 over what the noise explains. Without the sum, k >= 0 alone would cut off one half of the noise and keep the
-other: hundreds of values around a small core then add up to a halo that is not there. (Where the latent
-picture has noise of its own, which is taken off, the free minimum is not determined, and k >= 0 is all.) Its
+other: hundreds of values around a small core then add up to a halo that is not there. Its
 expected error is  e² = trace (X'X / q + diag(1 / t²))^-1 / |k|².
 
 A kernel that changes within the window (`varying`) is linear in the place, k + u k_u + v k_v with u and v
@@ -48,8 +47,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
-from lensmodel.core.numerics import fista, nonnegative_least_squares, on_simplex
-from lensmodel.core.psf import MEASURED, PsfSample, as_kernel, centred, centroid
+from lensmodel.core.numerics import fista, on_simplex
+from lensmodel.core.psf import MEASURED, PsfSample, as_kernel, centroid
 from lensmodel.core.types import CHANNELS, Channel, Kernel, LensSettings, NoiseModel, StepHook, ignore_step
 from lensmodel.photo import LinearPhoto
 
@@ -184,34 +183,25 @@ def solve(
     measured: NDArray[np.bool_],
     variance: NDArray[np.floating],
     size: int,
-    latent_noise: NDArray[np.floating] | None = None,
     *,
     even: bool = False,
     varying: bool = False,
 ) -> Solved:
     """Find the kernel of odd side `size` that makes the latent picture the observed one.
 
-    The latent picture has a margin of half a kernel; `latent_noise`, shape (2 size - 1, 2 size - 1), is the
-    autocovariance of noise that it has itself, which would pass for picture and make the kernel too wide.
-    Only without it may the kernel be `varying`; that needs no centring.
+    The latent picture has a margin of half a kernel. A kernel that may be `varying` needs no centring.
     """
     n, count = size * size, int(measured.sum())
     if count < n:
         raise NotEnoughEvidenceError(f"{count} pixels count, {n} are needed for a kernel of side {size}")
     weight = np.where(measured, 1.0 / np.maximum(variance, 1e-12), 0.0)
     whole = _gram(observed, latent, weight, size, even=even, varying=varying)
-    if latent_noise is not None:
-        # that of all values of a window of `size` pixels, shape (size², size²)
-        row, col = (i[:, None] - i + size - 1 for i in np.divmod(np.arange(n), size))
-        whole[:n, :n] -= latent_noise[row, col] * weight.sum()
     t = np.arange(size) - size // 2
     prior = ((1.0 + (t[:, None] ** 2 + t**2) / REACH**2) / PEAK).ravel() ** 2  # 1 / t(d)²
     k, misfit, moved = np.zeros(n), 1.0, np.zeros(2)
     gram = _of_kernel(whole, misfit, prior)
     for _ in range(2):  # the second time with the residuals of the first
-        a, b = gram[:n, :n] + np.diag(prior), gram[:n, n]
-        # less its noise a latent picture leaves directions open, and the free minimum's sum with them
-        k = _bounded(a, b, k) if latent_noise is None else nonnegative_least_squares(a, b, k, _STEPS)
+        k = _bounded(gram[:n, :n] + np.diag(prior), gram[:n, n], k)
         rest = np.append(-k, 1.0)
         misfit = max(misfit * float(rest @ gram @ rest) / count, 1.0)
         gram = _of_kernel(whole, misfit, prior)
@@ -375,9 +365,9 @@ class Window:
 
 
 def window_psf(
-    window: Window, latent: Latent, size: int, *, latent_noise: NDArray[np.floating] | None = None
-) -> tuple[Kernel, float, tuple[float, float]]:
-    """Measure the PSF of one window: kernel, expected error, and how far the latent picture was moved.
+    window: Window, latent: Latent, size: int, *, varying: bool = False
+) -> tuple[Solved, tuple[float, float]]:
+    """Measure the PSF of one window; say also how far the latent picture was moved.
 
     First a small kernel, whose centre of mass says how far the photo lies beyond the latent picture; that
     is moved, and solved again, so that the kernel comes out nearly centred and needs no interpolation, which
@@ -385,12 +375,7 @@ def window_psf(
     """
     _, shift = roughly(window, latent, min(SMALL, size))
     given = window.light, latent(shift, size // 2), window.measured, window.variance, size
-    if latent_noise is None:
-        solved = solve(*given, varying=True)
-        return solved.kernel, solved.error, shift
-    # less its noise a latent picture says too little of how the kernel changes, and of the best grid
-    solved = solve(*given, latent_noise)
-    return centred(solved.kernel), solved.error, shift
+    return solve(*given, varying=varying), shift
 
 
 def roughly(window: Window, latent: Latent, size: int = SMALL) -> tuple[Kernel, tuple[float, float]]:

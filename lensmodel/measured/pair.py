@@ -2,31 +2,27 @@
 
 The closed photo z is nearly sharp, and its own blur h is nearly known: diffraction and pixels. With the
 scene x,  z = h * x + n  and  y = k * x + n', so that x = z deconvolved by h is the sharp picture that the
-open photo y blurs, once it is laid under y to a part of a pixel. It keeps noise of its own, whose
-autocovariance is taken off where kernels are solved for.
-
-Where a scene has detail everywhere no flat place shows the noise, and five times as much would be estimated:
-the power of the finest detail in the quietest place is an upper bound of it.
+open photo y blurs, once it is laid under y to a part of a pixel. It keeps noise of its own, which makes
+kernels a little too wide: both photos are taken at base ISO.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from dataclasses import dataclass
+from itertools import product
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, block_means
+from lensmodel.core.psf import centred
+from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, StepHook, block_means
 from lensmodel.measured.measurer import Found, Latent, Measurer, Prepared, Window, window_corners, window_psf
 from lensmodel.measured.registration import CLEAR, Warp, match, matched
 from lensmodel.photo import LinearPhoto
-from lensmodel.photo.values import PlaneNoise
 
 USUAL_F_NUMBER: Final = 8.0  # of the closed photo where it does not say: the sharpest of most lenses
 _USUAL_PITCH_UM: Final = 4.5  # where the photo does not say (chosen)
@@ -35,7 +31,6 @@ _SPARE: Final = 24  # pixels around a window: deconvolution and interpolation sp
 _DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised more than eightfold
 _STOPS_APART: Final = 2.0  # least: blur that both photos share is missing in the kernel (chosen)
 _COARSE: Final = 4  # photos are shrunk so far for the first match: a nudged tripod is within reach (chosen)
-_NOISE_GRID: Final = 128  # frequencies along an axis: its lags have to hold two kernels (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,15 +53,14 @@ class AperturePair(Measurer):
     def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
         """Lay the closed photo under the open one, and find windows with most detail."""
         _require_pair(*photos)
-        opened, closed = _with_bounded_noise(photos)
+        opened, closed = photos
         warp = self.register(opened, closed, on_step)
         corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
 
         def psf_in(corner: tuple[int, int], channel: Channel) -> Found:
             window = Window.of(opened, channel, corner, self.side)
-            scene, noise = _scene(closed, warp, window, channel, size)
-            kernel, error, _ = window_psf(window, scene, size, latent_noise=noise)
-            return Found(kernel, error, window.middle)
+            solved, _ = window_psf(window, _scene(closed, warp, window, channel, size), size)
+            return Found(centred(solved.kernel), solved.error, window.middle)
 
         return corners, psf_in
 
@@ -112,21 +106,14 @@ def _require_pair(opened: LinearPhoto, closed: LinearPhoto) -> None:
         )
 
 
-def _scene(
-    closed: LinearPhoto, warp: Warp, window: Window, channel: Channel, size: int
-) -> tuple[Latent, NDArray[np.float64]]:
-    """Sharp picture around a window, on the pixels of the open photo, and the autocovariance of its noise.
+def _scene(closed: LinearPhoto, warp: Warp, window: Window, channel: Channel, size: int) -> Latent:
+    """Sharp picture around a window, on the pixels of the open photo.
 
     The cosine transform filters as if the picture were mirrored at its rim, which suits a transfer
     function that is real and even.
     """
     known, index = closed.info.metadata, CHANNELS.index(channel)
     lens = known.aperture or USUAL_F_NUMBER, known.pixel_pitch_um or _USUAL_PITCH_UM
-
-    def inverse(rows: NDArray[np.float64], cols: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Wiener's inverse of the closed lens's blur."""
-        h = diffraction_otf(rows, cols, *lens, channel)
-        return np.asarray((1.0 + _DAMPING) * h / (h * h + _DAMPING))
 
     def places(shift: tuple[float, float], margin: int) -> NDArray[np.float64]:
         t = np.arange(-margin, len(window.light) + margin)
@@ -138,17 +125,16 @@ def _scene(
     bottom, right = around.max(axis=(1, 2)).astype(int) + _SPARE + 1
     region = np.asarray(closed.planes[index, first[0] : bottom, first[1] : right], dtype=np.float64)
     down, along = (np.arange(n) / (2.0 * n) for n in region.shape)
-    sharp = fft.idctn(fft.dctn(region, norm="ortho") * inverse(down[:, None], along), norm="ortho")
+    h = diffraction_otf(down[:, None], along, *lens, channel)
+    inverse = (1.0 + _DAMPING) * h / (h * h + _DAMPING)  # Wiener's
+    sharp = fft.idctn(fft.dctn(region, norm="ortho") * inverse, norm="ortho")
     spline = ndimage.spline_filter(sharp, order=5, mode="mirror")
 
     def moved(shift: tuple[float, float], margin: int) -> NDArray[np.float64]:
         at = places(shift, margin) - first[:, None, None]
         return np.asarray(ndimage.map_coordinates(spline, at, order=5, prefilter=False, mode="mirror"))
 
-    f = fft.fftfreq(_NOISE_GRID)
-    power = np.square(inverse(f[:, None], f)) * closed.noise[index].variance(region.mean())
-    lags = np.arange(-(size - 1), size)
-    return moved, fft.ifft2(power).real[np.ix_(lags, lags)]
+    return moved
 
 
 def _detailed(
@@ -161,18 +147,14 @@ def _detailed(
     fine[ndimage.maximum_filter(clipped, 5)] = 0.0
     energy = ndimage.uniform_filter(np.minimum(fine, 20.0 * float(fine.mean())), side, mode="constant")
 
-    def starts(length: int, cells: int) -> list[NDArray[np.intp]]:
-        edges = [i * length // cells for i in range(cells + 1)]
-        last = length - side - margin
-        ranges = [np.arange(max(a - side // 4, margin), b, side // 4) for a, b in pairwise(edges)]
-        return [each[each <= last] for each in ranges if (each <= last).any()]
-
+    places = [np.arange(margin, length - side - margin + 1) for length in plane.shape]
     corners = []
-    for rows, cols in product(starts(plane.shape[0], down), starts(plane.shape[1], across)):
+    for rows, cols in product(np.array_split(places[0], down), np.array_split(places[1], across)):
         nearby = energy[np.ix_(rows + side // 2, cols + side // 2)]
-        k, l = np.unravel_index(int(nearby.argmax()), nearby.shape)
-        corners.append((int(rows[k]), int(cols[l])))
-    return list(dict.fromkeys(corners))
+        if nearby.size:
+            k, l = np.unravel_index(int(nearby.argmax()), nearby.shape)
+            corners.append((int(rows[k]), int(cols[l])))
+    return corners
 
 
 def diffraction_otf(
@@ -190,51 +172,3 @@ def diffraction_otf(
     v = np.minimum(v, 1.0)
     round_pupil = 2.0 / np.pi * (np.arccos(v) - v * np.sqrt(1.0 - v * v))
     return np.asarray(round_pupil * np.sinc(rows) * np.sinc(cols), dtype=np.float64)
-
-
-_BLOCK: Final = 64  # pixels: a larger one is nowhere without detail, a smaller by chance too quiet (chosen)
-_FINE: Final = (0.4, 0.5)  # cycles/pixel: below, lenses leave more
-_DARK: Final = 0.02  # of saturation: darker blocks show the black level rather than light (chosen)
-
-
-def _with_bounded_noise(photos: Sequence[LinearPhoto]) -> list[LinearPhoto]:
-    """Photos whose noise is no stronger than their quietest places show.
-
-    Photos of one camera at one ISO share the bound, since they share the sensor's noise.
-    """
-    bounds = np.array([[_quietest(photo, channel) for channel in range(len(CHANNELS))] for photo in photos])
-    if len({(photo.info.metadata.camera_model, photo.info.metadata.iso) for photo in photos}) == 1:
-        bounds[:] = bounds.min(axis=0)
-    return [
-        replace(
-            photo,
-            noise=_bounded(photo.noise, least),
-            sensor_noise=photo.sensor_noise and _bounded(photo.sensor_noise, least),
-        )
-        for photo, least in zip(photos, bounds.tolist(), strict=True)
-    ]
-
-
-def _quietest(photo: LinearPhoto, channel: int) -> float:
-    """Least power of fine detail over the level of light, of all blocks of a plane; inf where none is lit."""
-    window = np.outer(np.hanning(_BLOCK), np.hanning(_BLOCK))
-    radius = np.hypot(fft.fftfreq(_BLOCK)[:, None], fft.fftfreq(_BLOCK))
-    fine = (radius >= _FINE[0]) & (radius < _FINE[1])
-    least, plane = np.inf, photo.planes[channel]
-    for row in range(0, plane.shape[0] - _BLOCK + 1, _BLOCK // 2):
-        blocks = sliding_window_view(plane[row : row + _BLOCK], (_BLOCK, _BLOCK))[0, :: _BLOCK // 2]
-        level = blocks.mean(axis=(1, 2), dtype=np.float64)
-        lit = (level > _DARK) & (blocks.max(axis=(1, 2)) < photo.clip[channel])
-        if lit.any():
-            waves = fft.fft2((blocks[lit] - level[lit, None, None]) * window)[:, fine]
-            power = np.square(np.abs(waves)).mean(axis=1) / np.square(window).sum()
-            least = min(least, float((power / level[lit]).min()))
-    return least
-
-
-def _bounded(noise: PlaneNoise, least: Sequence[float]) -> PlaneNoise:
-    r, g, b = (
-        own if own.shot <= shot else NoiseModel(shot, own.read * shot / own.shot)
-        for own, shot in zip(noise, least, strict=True)
-    )
-    return r, g, b

@@ -344,7 +344,8 @@ def _solved(
     light = np.eye(6)[0]
     rough, shift = roughly(window, lit)
     light = _fitted_light(window, page(shift, SMALL // 2), rough)
-    return *window_psf(window, lit, size), light
+    solved, shift = window_psf(window, lit, size, varying=True)
+    return solved.kernel, solved.error, shift, light
 
 
 def _tones_of(

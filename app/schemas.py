@@ -424,7 +424,6 @@ class Support(Model):
     effective_samples: float
     photos: int
     extrapolated: bool
-    beyond: list[str] = Field([], description="in which variables it lies outside the samples")
     predicted_error: float | None
     weights: str = Field("", description="fingerprint of the network's weights, empty where none took part")
 

@@ -70,7 +70,7 @@ class LearnedField:
             min(float(answer.error[channel]), 1.0),
             np.asarray(answer.weights, dtype=np.float64),
             self._photos[rows],
-            query.support(self._where[rows], query.in_units(position, settings))[1],
+            query.nearest(self._where[rows], query.in_units(position, settings)),
             np.asarray(answer.ring_error[channel], dtype=np.float64),
         )
 

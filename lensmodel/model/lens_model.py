@@ -16,7 +16,7 @@ from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone, zone_of
 from lensmodel.model import camera_bodies
 from lensmodel.model.learned_field import LearnedField
-from lensmodel.model.query import MODES, PAPER, VARIABLES, PsfAnswer
+from lensmodel.model.query import FAR, MODES, PAPER, PsfAnswer
 from lensmodel.model.regression import Regression
 
 _LEAST_ERROR: Final = 0.01  # relative L2 below which no part of an answer is believed (chosen)
@@ -86,13 +86,12 @@ class LensModel:
         weights = np.concatenate([s * part.weights for s, part in zip(shares, parts, strict=True)])
         photos = np.concatenate([part.photos for part in parts])
         names, number = np.unique(photos.astype(str), return_inverse=True)
-        beyond = set.intersection(*(set(part.beyond) for part in parts))
         return PsfAnswer(
             kernel=kernel,
             predicted_error=min(float(precision.sum() ** -0.5), 1.0),
             effective_samples=1.0 / float(weights @ weights),
             photos=int(np.count_nonzero(np.bincount(number, weights, len(names)) > _LISTED)),
-            beyond=tuple(name for name in VARIABLES if name in beyond),
+            extrapolated=min(part.nearest for part in parts) > FAR,
             weights=self.weights,
             ring_error=parts[0].ring_error if len(parts) == 1 else None,
         )

@@ -9,7 +9,7 @@ By the one the regression weighs samples (paper, eq. 7), in bandwidths::
 with c on the unit circle, so that pi and -pi are neighbours: |c - c_i| is the chord 2 sin(d/2).
 Near the centre of the image all angles are neighbours, so the circle shrinks with r there.
 
-The other, `support`, says how far a question lies from all samples, in units in which a PSF changes by about
+The other, `nearest`, says how far a question lies from all samples, in units in which a PSF changes by about
 as much. They do not shrink as samples come, as bandwidths do: what is near stays near::
 
     d^2 = |p - p_i|^2 / 0.2^2 + (stops apart)^2 + (octaves of focal length apart / 0.5)^2
@@ -31,8 +31,6 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, Kernel, LensSettings
 
-# in which a question can lie beyond the samples
-VARIABLES: Final = ("place", "aperture_stops", "focal_octaves", "focus_dioptres")
 # of x, y, stops, octaves and dioptres (chosen: kernels of usual lenses differ by 0.1 to 0.2 over each)
 UNITS: Final = np.array([0.2, 0.2, 1.0, 0.5, 0.5])
 FAR: Final = 2.5  # units: a Gaussian has fallen to 0.04 there (chosen)
@@ -85,17 +83,9 @@ def in_units(position: FieldPosition, settings: LensSettings) -> NDArray[np.floa
     return np.array([*position.xy, *_numbers(settings)]) / UNITS
 
 
-def support(where: NDArray[np.float64], asked: NDArray[np.float64]) -> tuple[float, tuple[str, ...]]:
-    """Distance from a point `(5,)` to the nearest of `(n, 5)`, and in which of `VARIABLES` all are far."""
-    gaps = np.abs(where - asked)
-    gaps[np.isnan(gaps)] = 0.0
-    each = np.concatenate([np.hypot(gaps[:, :1], gaps[:, 1:2]), gaps[:, 2:]], axis=1)
-    distance = np.sqrt((each**2).sum(axis=1))
-    nearest = int(distance.argmin())
-    beyond = [name for name, least in zip(VARIABLES, each.min(axis=0), strict=True) if least > FAR]
-    if not beyond and distance[nearest] > FAR:
-        beyond = [VARIABLES[int(each[nearest].argmax())]]
-    return float(distance[nearest]), tuple(beyond)
+def nearest(where: NDArray[np.float64], asked: NDArray[np.float64]) -> float:
+    """Distance from a point `(5,)` to the nearest of others `(n, 5)`; unknowns drop out."""
+    return float(np.linalg.norm(np.nan_to_num(where - asked), axis=1).min())
 
 
 # --- what is asked and answered ------------------------------------------------------------------
@@ -118,8 +108,8 @@ class PsfAnswer:
         1 / sum W^2 of the samples' weights W in the answer, of sum 1.
     photos : int
         Photos of these samples.
-    beyond : tuple of str
-        Variables in which the question lies far from all samples.
+    extrapolated : bool
+        Whether no sample is near the question in place and settings.
     weights : str
         Fingerprint of the network's weights; empty where no network took part.
     ring_error : ndarray of float64, shape (8,), or None
@@ -130,14 +120,9 @@ class PsfAnswer:
     predicted_error: float
     effective_samples: float
     photos: int
-    beyond: tuple[str, ...]
+    extrapolated: bool
     weights: str = ""
     ring_error: NDArray[np.float64] | None = None
-
-    @property
-    def extrapolated(self) -> bool:
-        """Whether no sample is near."""
-        return bool(self.beyond)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,5 +133,5 @@ class Part:
     error: float  # expected relative L2
     weights: NDArray[np.float64]  # (n,), of the samples in the answer, of sum 1
     photos: NDArray[np.object_]  # (n,), of these samples
-    beyond: tuple[str, ...]  # variables in which the question lies far from all of them
+    nearest: float  # distance of the nearest of them, in units
     ring_error: NDArray[np.float64] | None = None

@@ -56,7 +56,7 @@ _REACH: Final = 5.0  # bandwidths: a Gaussian has fallen to 4e-6 there
 _DROPPED: Final = 3e-5  # samples that together weigh less are left out (chosen: below single precision)
 _FEW: Final = 8  # neighbours at least, however far: a mean of fewer is no better than its worst (chosen)
 
-_DRIFT: Final = 0.15  # relative L2 for each unit of `support` beyond the first to the nearest sample (chosen)
+_DRIFT: Final = 0.15  # relative L2 for each unit beyond the first to the nearest sample (chosen)
 # the same for each unit beyond the outermost sample (chosen: the median of drawn lenses wide open changes by
 # .53 to .62 over a unit outwards; no command repeats it)
 _OUTWARD: Final = 0.5
@@ -134,14 +134,14 @@ class Regression:
         """Answer at a place, in pixels of some pitch."""
         near = self._around.near([position], settings)
         where, asked = self._where[near.rows], query.in_units(position, settings)
-        nearest, beyond = query.support(where, asked)
+        nearest = query.nearest(where, asked)
         outward = math.hypot(*asked[:2]) - float(np.hypot(where[:, 0], where[:, 1]).max())
         return Part(
             self.kernels([position], settings, size, pitch_um)[0],
             self._error(near, nearest, max(outward, 0.0)),
             near.weights,
             self._photos[near.rows],
-            beyond,
+            nearest,
         )
 
     def kernels(

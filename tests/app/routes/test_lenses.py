@@ -183,7 +183,7 @@ def test_a_lens_without_samples_says_what_to_do(client: TestClient, steps: Steps
 
 def test_a_strict_question_outside_the_samples_is_refused(client: TestClient, lens: str) -> None:
     support = ask(client, lens, aperture=128)["support"]
-    assert (support["extrapolated"], support["beyond"]) == (True, ["aperture_stops"])
+    assert support["extrapolated"] is True
     strict = client.get(f"{lens}/psf?r=0.9&phi=0.59&aperture=128&strict=true")
     assert refusal(strict) == (422, "outside_support")
 

@@ -358,16 +358,11 @@ def test_beyond_the_outermost_samples_the_error_grows_with_the_way_outward() -> 
     assert rim < 0.7
 
 
-@pytest.mark.parametrize(
-    ("r", "aperture", "beyond"), [(0.3, 2.0, ()), (1.0, 2.0, ("place",)), (0.3, 8.0, ("aperture_stops",))]
-)
-def test_a_question_far_from_every_sample_says_in_what(
-    r: float, aperture: float, beyond: tuple[str, ...]
-) -> None:
+@pytest.mark.parametrize(("r", "aperture", "far"), [(0.3, 2.0, False), (1.0, 2.0, True), (0.3, 8.0, True)])
+def test_a_question_far_from_every_sample_is_told(r: float, aperture: float, far: bool) -> None:
     model = LensModel.fit([s for s in photos(3) if s.position.r < 0.5])
-    answer = model.query(FieldPosition(r, 0.2), LensSettings(aperture=aperture), SIZE)
 
-    assert (answer.beyond, answer.extrapolated) == (beyond, bool(beyond))
+    assert model.query(FieldPosition(r, 0.2), LensSettings(aperture=aperture), SIZE).extrapolated == far
 
 
 def test_unknown_aperture_takes_no_part_in_distances() -> None:

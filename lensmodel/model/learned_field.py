@@ -17,7 +17,7 @@ import numpy as np
 import scipy  # `spatial` is loaded where it is needed: it takes a second
 from numpy.typing import NDArray
 
-from lensmodel.core.psf import KINDS, PatchKind, PsfSample, centred
+from lensmodel.core.psf import KINDS, EncodedPatch, PatchKind, PsfSample, centred
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, query
 from lensmodel.model.query import Part
@@ -39,20 +39,14 @@ class LearnedField:
 
     def __init__(self, samples: Sequence[PsfSample]) -> None:
         self.network = FieldNetwork.load()
-        kinds = [sample.encoded.kind for sample in samples if sample.encoded is not None]
-        self._kind = np.array([KINDS.index(kind) for kind in kinds])
-        self._conditions = np.array(
-            [
-                conditions_of(s.settings, s.pixel_pitch_um, kind)
-                for s, kind in zip(samples, kinds, strict=True)
-            ]
-        )
-        self._tokens = _tokens(samples, self._conditions, self.network)
+        patches = [sample.encoded for sample in samples if sample.encoded is not None]
+        pairs = zip(samples, patches, strict=True)
+        self._conditions = np.array([conditions_of(s.settings, s.pixel_pitch_um, p.kind) for s, p in pairs])
         self._xy = np.array([s.position.xy for s in samples])  # half diagonals, to the right and up
+        self._tokens = self._tokens_of(samples, patches)
         self._where = np.array([query.in_units(s.position, s.settings) for s in samples])
-        unknown = np.isnan(self._where)
-        columns = zip(self._where.T, ~unknown.T, strict=True)
-        self._usual = np.array([np.median(column[has]) if has.any() else 0.0 for column, has in columns])
+        known = (column[~np.isnan(column)] for column in self._where.T)
+        self._usual = np.array([np.median(values) if values.size else 0.0 for values in known])
         self._usual_pitch = camera_bodies.usual_pitch(samples)
         self._pitch = np.array([s.pixel_pitch_um for s in samples], dtype=np.float64)  # NaN = unknown
         self._photos = np.array([s.photo for s in samples], dtype=object)
@@ -60,6 +54,20 @@ class LearnedField:
         self._tree = lru_cache(maxsize=4)(self._tree_of)
         self._memory = lru_cache(maxsize=_MEMORIES)(self._memory_of)
         self._answer = lru_cache(maxsize=_ANSWERS)(self._answer_of)
+
+    def _tokens_of(
+        self, samples: Sequence[PsfSample], patches: Sequence[EncodedPatch]
+    ) -> NDArray[np.float16]:
+        """Tokens of samples; those that other weights made are made anew of the statistics."""
+        tokens = np.array([patch.token for patch in patches], dtype=np.float16)
+        stale: dict[tuple[str, bytes], list[int]] = {}
+        for row, sample in enumerate(samples):
+            if not sample.estimator.endswith(f"/{self.network.name}"):
+                stale.setdefault((sample.photo, self._conditions[row].tobytes()), []).append(row)
+        for rows in stale.values():
+            statistics = np.array([patches[row].statistics for row in rows], dtype=np.float32)
+            tokens[rows] = self.network.encode(statistics, self._xy[rows], self._conditions[rows[0]])
+        return tokens
 
     def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:
         """Answer at a place, in pixels of some pitch."""
@@ -94,7 +102,7 @@ class LearnedField:
         rows = self._nearest(pitch_um, np.array(cell, dtype=np.float64)) if cell else self._tree(pitch_um)[0]
         tokens = self._tokens[rows].astype(np.float32)
         memory = self.network.memory(tokens, self._xy[rows], self._conditions[rows])
-        return rows, memory, KINDS[int(np.bincount(self._kind[rows]).argmax())]
+        return rows, memory, KINDS[int(np.bincount(self._conditions[rows, -1].astype(int)).argmax())]
 
     def _nearest(self, pitch_um: float | None, cell: NDArray[np.float64]) -> NDArray[np.intp]:
         """The `NEAREST` samples of a pitch, as many of each photo."""
@@ -124,20 +132,3 @@ class LearnedField:
         near = min(len(self._tokens), NEAREST)
         kept = (1 if near < NEAREST else _MEMORIES) * near * _KEY_BYTES
         return self._tokens.nbytes + len(self._tokens) * _ROW_BYTES + kept
-
-
-def _tokens(
-    samples: Sequence[PsfSample], conditions: NDArray[np.float64], network: FieldNetwork
-) -> NDArray[np.float16]:
-    """Tokens of samples; those that other weights made are made anew of the statistics, photo by photo."""
-    encoded = [sample.encoded for sample in samples if sample.encoded is not None]
-    tokens = np.array([patch.token for patch in encoded], dtype=np.float16)
-    stale: dict[tuple[str, bytes], list[int]] = {}
-    for row, sample in enumerate(samples):
-        if not sample.estimator.endswith(f"/{network.name}"):
-            stale.setdefault((sample.photo, conditions[row].tobytes()), []).append(row)
-    for rows in stale.values():
-        statistics = np.array([encoded[row].statistics for row in rows], dtype=np.float32)
-        xy = np.array([samples[row].position.xy for row in rows])
-        tokens[rows] = network.encode(statistics, xy, conditions[rows[0]])
-    return tokens

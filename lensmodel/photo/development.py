@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 from lensmodel.core.errors import (
     InvalidInputError,
     LensModelError,
-    MetadataMissingError,
     NotAnImageError,
     RawDecodeError,
     TruncatedImageError,
@@ -157,12 +156,8 @@ def develop(
     path, limits = Path(path), limits or Limits()
     with _opened(path, limits) as (said, raw):
         info = _info_of(path, said, raw, limits)
-        try:
-            if on_info is not None:
-                on_info(info)
-        except MetadataMissingError:  # of a photo that is damaged nobody shall look up what it does not say
-            _read_pixels(path, said.header) if raw is None else Mosaic.of(raw)
-            raise
+        if on_info is not None:
+            on_info(info)
         developed = _develop_raster(path, said, info) if raw is None else _develop_raw(raw, said, info)
     for remark in developed.remarks:
         remarks_log.warning("%s: %s", path.name, remark)

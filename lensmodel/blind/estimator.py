@@ -13,7 +13,7 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, centred, resized
 from lensmodel.core.types import Kernel, LensSettings, NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.patches import Patch, Selection
-from lensmodel.patches.windows import repeats
+from lensmodel.patches.windows import periodogram, repeats
 from lensmodel.photo.values import LinearPhoto
 
 _MIN_SIDE = 64  # pixels: one tile of a patch's spectrum
@@ -146,7 +146,7 @@ def _unfit(patch: Plane, model: NoiseModel) -> str | None:
     steps = 0.5 * float(np.var(np.diff(patch, axis=0)) + np.var(np.diff(patch, axis=1)))
     if steps > 1.4 * float(patch.var()):
         return "noise"
-    if repeats(patch):
+    if repeats(periodogram(patch - patch.mean()), sigma**2, patch.shape):
         return "periodic"
     return None
 

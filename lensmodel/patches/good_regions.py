@@ -14,14 +14,14 @@ from lensmodel.patches.windows import Details, Windows
 
 MODEL: Final = Path(__file__).parent / "data" / "good_regions.npz"
 
-FEATURES: Final = 41  # columns that `features_of` makes
+FEATURES: Final = 34  # columns that `features_of` makes
 
 
 def features_of(windows: Windows, looked: Details) -> NDArray[np.float64]:
     """What a window looks like, in numbers, `(n, FEATURES)`, always finite.
 
     Directions are sorted by energy, so that a turned window has the same features. Energies and
-    powers are decimal logarithms over noise; an unknown width is 0.
+    powers are decimal logarithms over noise.
     """
 
     def log(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -29,7 +29,6 @@ def features_of(windows: Windows, looked: Details) -> NDArray[np.float64]:
 
     share = windows.directions / np.maximum(windows.directions.sum(axis=1, keepdims=True), 1e-9)
     entropy = -(share * np.log(np.maximum(share, 1e-9))).sum(axis=1)
-    width, widest = np.nan_to_num(windows.width), np.nan_to_num(windows.widest)
     bands = looked.information / np.log(10.0)
     means = bands.mean(axis=2)
     by_band = np.stack([means, bands.min(axis=2), bands.max(axis=2), bands.std(axis=2)], axis=2)
@@ -45,16 +44,9 @@ def features_of(windows: Windows, looked: Details) -> NDArray[np.float64]:
         windows.r_kept,
         windows.clipped,
         windows.dark,
-        width,
-        widest,
-        np.where(width > 0.0, widest / np.maximum(width, 1e-3), 0.0),
-        np.hypot(*windows.elongation.T),
         by_band.reshape(len(windows), -1).T,
         np.diff(means, axis=1).T,
-        looked.period,
-        log(looked.blockiness),
         log(looked.blob.astype(np.float64)),
-        log(looked.kurtosis),
     ]
     return np.vstack(columns).T
 

@@ -28,9 +28,7 @@ from lensmodel.photo.values import LinearPhoto
 
 logger = logging.getLogger(__name__)
 
-Reason: TypeAlias = Literal[
-    "border", "clipped", "dark", "flat", "one-directional", "periodic", "jpeg-blocks", "duplicate"
-]
+Reason: TypeAlias = Literal["border", "clipped", "dark", "flat", "one-directional", "periodic", "duplicate"]
 """Why a window was not taken; `duplicate` means that a better one lies too near or the quota is full."""
 
 SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
@@ -43,8 +41,6 @@ FLAT_CONTRAST: Final = 4.0  # variance of signal over noise: below, noise decide
 FLAT_EIGENVALUE: Final = 10.0  # smaller eigenvalue of the structure tensor over that of noise (chosen)
 ONE_DIRECTION_RATIO: Final = 0.05  # the same over the larger one: a line has next to nothing (chosen)
 SECTOR_INFORMATION: Final = float(np.log(2.0))  # power twice that of noise, signal as strong as noise
-PERIOD_LIMIT: Final = 0.8  # a repetition is as alike as that, other scenes seldom (chosen)
-BLOCKINESS_LIMIT: Final = 1.8  # chance gives a little more than 1, and twice is plain to see (chosen)
 JPEG_WEIGHT: Final = 0.3  # JPEG files were sharpened and gamma-coded: their patches count for less
 EVIDENCE_FLOOR: Final = 0.25  # bits a frequency: signal as strong as noise over a quarter of them
 SHORTLIST_A_SECTOR: Final = 8  # windows that the costlier scores look at: several times those taken (chosen)
@@ -55,7 +51,6 @@ _ADVICE: Final[dict[str, str]] = {
     "clipped": "expose shorter",
     "one-directional": "take a scene with edges in all directions",
     "periodic": "avoid fences, grids and facades that repeat",
-    "jpeg-blocks": "use the RAW file or a higher JPEG quality",
     "border": "crop the empty border away",
 }
 
@@ -97,8 +92,7 @@ class Selector(Protocol):
     def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
         """Score the n windows of a photo, shape (n,), 0..1: higher tells more.
 
-        `windows` tells where they lie, their edges, noise and clipping, `looked` their spectra, periods and
-        blocks of JPEG.
+        `windows` tells where they lie, their edges, noise and clipping, `looked` their spectra.
         """
 
 
@@ -188,8 +182,7 @@ def _second_reasons(looked: Details) -> NDArray[np.str_]:
     return _first(
         ("clipped", looked.blob > BLOB_LIMIT),
         ("flat", looked.evidence < EVIDENCE_FLOOR),
-        ("periodic", looked.period > PERIOD_LIMIT),
-        ("jpeg-blocks", looked.blockiness > BLOCKINESS_LIMIT),
+        ("periodic", looked.periodic),
         ("one-directional", looked.information[:, 0].min(axis=1) < SECTOR_INFORMATION),
     )
 

@@ -1,13 +1,12 @@
 """The windows of a photo: what is known of each candidate, as arrays.
 
 One pass over a plane sums over small blocks, from which any window is put together (`windows_of`). A few are
-then looked at by themselves (`details_of`): their spectrum, periods, blocks and blobs.
+then looked at by themselves (`details_of`): their spectrum, repetition and blobs.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -29,16 +28,10 @@ from lensmodel.patches.rmap import (
 
 ORIENTATIONS: Final = 8  # bins of gradient direction over half a turn, with edges enough in each (chosen)
 BLOCKS_A_SIDE: Final = 4  # of a window, which starts at any: finer starts find nearly the same ones (chosen)
-WIDTH_BINS: Final = 28
-WIDTH_STEP_PX: Final = 0.2  # of a histogram of edge widths, 0 to 5.6 px (chosen: finer than photos differ)
-# Of a gradient's noise: above, a pixel is an edge (one of 3000 by chance), or one whose width is measured,
-# where noise must not move the edge's end (chosen)
-EDGE_SIGMAS, WIDTH_SIGMAS = 4.0, 10.0
+EDGE_SIGMAS: Final = 4.0  # of a gradient's noise: above, a pixel is an edge (one of 3000 by chance)
 CLIP_SHARE: Final = 0.98  # noise and demosaicing leave clipped pixels a little below the level (chosen)
 DARK_SNR: Final = 5.0  # level over noise below which a pixel is dark: ten is half a photo of 1 % noise
 SLOPE_ORDER: Final = 2  # of the polynomial that is taken off first: a sky or shading is no detail
-MIN_RIDGE_PIXELS: Final = 30  # fewer do not give a width: nine of them would lie below its quantile (chosen)
-WIDTH_QUANTILE: Final = 0.3  # soft edges of the scene widen the upper half of the widths (chosen)
 
 _MARGIN = 18  # half an r-map window and the smoothing
 _STRIP_PIXELS = 2_000_000  # at once, 8 MB a plane of float32: the calls cost little beside the work (chosen)
@@ -65,9 +58,6 @@ class Windows:
     clipped: NDArray[np.float64]
     dark: NDArray[np.float64]
     missing: NDArray[np.float64]
-    width: NDArray[np.float64]  # (n,), of the sharper edges, sigma of a Gaussian in pixels; NaN where few
-    widest: NDArray[np.float64]  # (n,), the same of the widest quarter: a depth step inside shows there
-    elongation: NDArray[np.float64]  # (n, 2), cosine and sine of the squared width over twice the angle
 
     def __len__(self) -> int:
         return int(self.rows.size)
@@ -98,7 +88,7 @@ def windows_of(
     blocks = {name: np.concatenate([strip[name] for strip in strips]) for name in strips[0]}
 
     size, area = BLOCKS_A_SIDE * side, (BLOCKS_A_SIDE * side) ** 2
-    sums = {name: _flat(_square_sum(part, BLOCKS_A_SIDE)) for name, part in blocks.items()}
+    sums = {name: _square_sum(part, BLOCKS_A_SIDE) for name, part in blocks.items()}
     down, along = (np.arange(count - BLOCKS_A_SIDE + 1) * side for count in (n, m))
     tops, lefts = (each.ravel() for each in np.meshgrid(row + down, col + along, indexing="ij"))
     r, phi = frame.polar(tops + (size - 1) / 2.0, lefts + (size - 1) / 2.0)
@@ -128,9 +118,6 @@ def windows_of(
         clipped=sums["clipped"] / area,
         dark=sums["dark"] / area,
         missing=sums["missing"] / area,
-        width=_typical_width(sums["widths"]),
-        widest=_widest_quarter(blocks["widths"]),
-        elongation=_elongation(*np.moveaxis(sums["squared_widths"], -1, 0)),
     )
 
 
@@ -154,24 +141,20 @@ def _strip_sums(
     def block_sum(what: NDArray[np.generic]) -> NDArray[np.float64]:
         return what.reshape(n, side, m, side).sum(axis=(1, 3), dtype=np.float64)
 
-    def by_bin(
-        at: NDArray[np.intp], bins: NDArray[np.intp] | int, count: int, weights: Plane | None = None
-    ) -> NDArray[Any]:
-        return np.bincount(block[at] * count + bins, weights, n * m * count).reshape(n, m, count)
-
     sigma = np.sqrt(noise.variance(smooth[inner]))
     unit = sigma.astype(np.float32) * np.float32(gradient_noise())
     edges = np.flatnonzero(modulus > EDGE_SIGMAS * unit)
     gr_at, gc_at = gr.ravel()[edges], gc.ravel()[edges]
-    orientation, r_bins = _orientation(gr_at, gc_at), r_bin(r[inner].ravel()[edges])
-    energy = by_bin(edges, orientation * R_BINS + r_bins, ORIENTATIONS * R_BINS, modulus.ravel()[edges] ** 2)
-    tensor = [by_bin(edges, 0, 1, product) for product in (gr_at * gr_at, gr_at * gc_at, gc_at * gc_at)]
-    groups = orientation // (ORIENTATIONS // GROUPS) * R_BINS + r_bins
+    turn = np.arctan2(gr_at, gc_at) * (ORIENTATIONS / np.pi)  # 0 is along columns, growing downwards
+    orientation = np.floor(turn + 0.5).astype(np.intp) % ORIENTATIONS
+    r_bins = r_bin(r[inner].ravel()[edges])
 
-    ridges = np.flatnonzero(_ridge(along_rows, along_cols, size)[inner] & (modulus > WIDTH_SIGMAS * unit))
-    square = _squared_widths(smooth, inner, modulus, ridges)
-    across = _orientation(gr.ravel()[ridges], gc.ravel()[ridges])
-    squared_widths = [by_bin(ridges, across, ORIENTATIONS, weights) for weights in (None, square)]
+    def by_bin(bins: NDArray[np.intp] | int, count: int, weights: NDArray[np.float32]) -> NDArray[Any]:
+        return np.bincount(block[edges] * count + bins, weights, n * m * count).reshape(n, m, count)
+
+    energy = by_bin(orientation * R_BINS + r_bins, ORIENTATIONS * R_BINS, modulus.ravel()[edges] ** 2)
+    tensor = [by_bin(0, 1, product) for product in (gr_at * gr_at, gr_at * gc_at, gc_at * gc_at)]
+    groups = orientation // (ORIENTATIONS // GROUPS) * R_BINS + r_bins
     return {
         "energy": energy.reshape(n, m, ORIENTATIONS, R_BINS).astype(np.float32),
         "tensor": np.concatenate(tensor, axis=2),
@@ -180,59 +163,16 @@ def _strip_sums(
         "clipped": block_sum(level >= CLIP_SHARE * clip),
         "dark": block_sum(smooth[inner] < DARK_SNR * sigma),
         "missing": block_sum(~finite[inner]),
-        "widths": by_bin(ridges, (np.sqrt(square) / WIDTH_STEP_PX).astype(np.intp), WIDTH_BINS),
-        "squared_widths": np.stack(squared_widths, axis=-1),  # by direction: how many, and their sum
         "histogram": np.bincount(groups, minlength=GROUPS * R_BINS).reshape(GROUPS, R_BINS),
     }
 
 
-def _ridge(along_rows: Plane, along_cols: Plane, modulus: Plane) -> NDArray[np.bool_]:
-    """Where no neighbour across the edge is steeper; the rim has one neighbour only and is let through."""
-    center, inside = modulus[1:-1, 1:-1], (slice(1, -1), slice(1, -1))
-    ridge = np.ones(modulus.shape, dtype=np.bool_)
-    ridge[inside] = np.where(
-        np.abs(along_rows[inside]) > np.abs(along_cols[inside]),
-        (center >= modulus[:-2, 1:-1]) & (center >= modulus[2:, 1:-1]),
-        (center >= modulus[1:-1, :-2]) & (center >= modulus[1:-1, 2:]),
-    )
-    return ridge
-
-
-def _squared_widths(
-    smooth: Plane, inner: tuple[slice, slice], modulus: Plane, at: NDArray[np.intp]
-) -> NDArray[np.float32]:
-    """Squared width of the blur at pixels `at` on edge ridges, by the ratio R of gradients before and after.
-
-    A step blurred by s is smoothed by 1 px, then by 1 px more::
-
-        R² = (s² + 2) / (s² + 1),        s² = 1 / (R² - 1) - 1
-
-    Source: S. Zhuo and T. Sim, "Defocus map estimation from a single image", Pattern Recognition 44, 2011,
-    eq. (3) to (5).
-    """
-    again = np.asarray(ndimage.gaussian_filter(smooth, 1.0, truncate=3.0), dtype=np.float32)
-    second = np.hypot(*(np.asarray(part)[inner] for part in np.gradient(again)))
-    excess = np.square(modulus.ravel()[at] / np.maximum(second.ravel()[at], 1e-12)) - 1.0
-    square = 1.0 / np.maximum(excess, 1e-3) - 1.0
-    return np.clip(square, 0.0, (WIDTH_BINS * WIDTH_STEP_PX) ** 2 - 1e-3)
-
-
-def _orientation(along_rows: NDArray[np.float32], along_cols: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Bin of the gradient's direction over half a turn, 0 = along columns, growing downwards."""
-    angle = np.arctan2(along_rows, along_cols) * (ORIENTATIONS / np.pi)
-    return np.floor(angle + 0.5).astype(np.intp) % ORIENTATIONS
-
-
 def _square_sum(values: NDArray[np.generic], side: int) -> NDArray[np.float64]:
-    """Sum of every square of `side` blocks, `(n, m, ...)` to `(n - side + 1, m - side + 1, ...)`."""
+    """Sum of every square of `side` blocks, `(n, m, ...)` to `((n - side + 1) (m - side + 1), ...)`."""
     out = np.asarray(values, dtype=np.float64)
     for axis in (0, 1):
         out = sliding_window_view(out, side, axis=axis).sum(axis=-1)
-    return out
-
-
-def _flat(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return values.reshape(-1, *values.shape[2:])
+    return out.reshape(-1, *out.shape[2:])
 
 
 def _slope_variance(means: NDArray[np.float64], side: int) -> NDArray[np.float64]:
@@ -257,40 +197,6 @@ def _polynomials(size: int) -> NDArray[np.float64]:
     return np.stack([np.outer(t**i, t**j) for i in orders for j in orders if i + j <= SLOPE_ORDER])
 
 
-def _typical_width(histogram: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quantile of binned widths, linear inside its bin."""
-    total = histogram.sum(axis=1)
-    below = histogram.cumsum(axis=1)
-    at = np.minimum((below < WIDTH_QUANTILE * total[:, None]).sum(axis=1), WIDTH_BINS - 1)
-    pick = np.arange(len(total))
-    inside = np.maximum(histogram[pick, at], 1.0)
-    part = 1.0 - (below[pick, at] - WIDTH_QUANTILE * total) / inside
-    return np.where(total >= MIN_RIDGE_PIXELS, (at + np.clip(part, 0.0, 1.0)) * WIDTH_STEP_PX, np.nan)
-
-
-def _widest_quarter(histograms: NDArray[np.int64]) -> NDArray[np.float64]:
-    half = BLOCKS_A_SIDE // 2
-    sums = _square_sum(histograms, half)
-    n, m = sums.shape[0] - half, sums.shape[1] - half
-    quarters = [sums[i : i + n, j : j + m] for i in (0, half) for j in (0, half)]
-    return np.fmax.reduce([_typical_width(_flat(part)) for part in quarters])
-
-
-def _elongation(count: NDArray[np.float64], square: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Fit s² = a (1 + c cos 2t + s sin 2t) to the mean squared widths by direction."""
-    angle = 2.0 * np.pi * np.arange(ORIENTATIONS) / ORIENTATIONS
-    basis = np.stack([np.ones(ORIENTATIONS), np.cos(angle), np.sin(angle)], axis=1)
-    # Directions weigh equally up to 20 pixels, so that one long edge does not decide alone.
-    weight = np.minimum(count, 20.0)
-    mean = square / np.maximum(count, 1.0)
-    normal = np.einsum("nd,di,dj->nij", weight, basis, basis) + 1e-3 * np.eye(3)
-    fit = np.linalg.solve(normal, np.einsum("nd,nd,di->ni", weight, mean, basis)[..., None])[..., 0]
-    known = ((count >= 5.0).sum(axis=1) >= ORIENTATIONS // 2) & (fit[:, 0] > 1e-3)
-    relative = fit[:, 1:] / np.maximum(fit[:, :1], 1e-3)
-    relative /= np.maximum(np.hypot(*relative.T), 1.0)[:, None]
-    return np.where(known[:, None], relative, 0.0)
-
-
 # --- the second look -----------------------------------------------------------------------------
 
 SECTORS: Final = 8  # of 22.5 degrees: a line lies in one or two
@@ -302,21 +208,17 @@ EVIDENCE_EDGES: Final = (0.1, 0.2, 0.3, 0.4)
 NON_UNIFORMITY: Final = 0.005  # relative deviation of the gain of pixels: 0.3 to 1 percent by EMVA 1288
 DYNAMIC_RANGE: Final = 2.0**14.8  # of the best sensors: less noise was eaten by rounding or denoising
 
-_JPEG_BLOCK = 8  # pixels: ITU-T T.81
-_MAIN_LOBE_PX = 8  # pixels: nearer peaks of the autocorrelation are the blur itself (chosen)
-_ON_THE_WAY = 24  # points from a peak to the middle: a valley is wider than a twentieth of it (chosen)
-_CORE_PX = (2, 4)  # nearer than this neighbours are alike: for the valley, for the peak
-_REPEATS = (-0.4, 0.9)  # correlation at the valley and the peak of what repeats
+_MAIN_LOBE_PX: Final = 8  # nearer peaks of the autocorrelation are the blur itself (chosen)
+_ON_THE_WAY: Final = 24  # points from a peak to the middle: a valley is wider than a twentieth of it (chosen)
+_ALIKE: Final = 0.8  # peak of what repeats: other scenes seldom are as alike as that (chosen)
 
 
 class Details(NamedTuple):
     """Second look at some windows; every array has one entry a window along axis 0."""
 
     information: NDArray[np.float64]  # (n, BANDS, SECTORS), natural logarithm of mean power over noise
-    period: NDArray[np.float64]  # (n,), highest separate peak of the autocorrelation, 1 for a perfect period
-    blockiness: NDArray[np.float64]  # (n,), steps on an 8 px grid over steps off it; 1 where there is none
+    periodic: NDArray[np.bool_]  # (n,), whether it `repeats`
     blob: NDArray[np.int64]  # (n,), pixels of the largest connected clipped area
-    kurtosis: NDArray[np.float64]  # (n,), of differences; 3 for a Gaussian, more for isolated edges
     evidence: NDArray[np.float64]  # (n,), bits a frequency between 0.1 and 0.4 cycles/pixel; 0 for noise
 
 
@@ -324,31 +226,22 @@ def details_of(plane: Plane, windows: Windows, clip: float, coarse: NoiseModel |
     """Look at windows of a plane; `coarse` is the noise between 0.1 and 0.4 cycles/pixel where it is more."""
     size = windows.size
     slopes = np.linalg.qr(_polynomials(size).reshape(-1, size * size).T)[0]
-    hann = np.outer(*[np.hanning(size + 2)[1:-1]] * 2)
-    taper = _correlation(np.square(np.abs(fft.rfft2(hann))), hann.shape)  # takes weight from long lags
     bands, evident = (_sectors(size, edges) for edges in (BAND_EDGES, EVIDENCE_EDGES))
-    square = np.square(2.0 * np.pi * np.hypot(fft.fftfreq(size)[:, None], fft.rfftfreq(size)))
-    of_gradients = square * np.exp(-2.0 * square)  # smoothed ones
     fine = np.square(windows.sigma)
     noise = fine if coarse is None else np.maximum(fine, coarse.variance(windows.level))
     rows = []
     for i, corner in enumerate(zip(windows.rows.tolist(), windows.cols.tolist(), strict=True)):
         values = np.array(plane[corner[0] :, corner[1] :][:size, :size], dtype=np.float64)
         detrended = (values.ravel() - slopes @ (values.ravel() @ slopes)).reshape(values.shape)
-        # periodogram under a Hann window, scaled so that white noise gives its variance
-        power = np.square(np.abs(fft.rfft2(detrended * hann))) / np.square(hann).sum()
+        power = periodogram(detrended)
         information = np.log(np.maximum(_means(power, bands)[0] / max(fine[i], 1e-12), 1e-3))
-        gradients = _correlation(np.maximum(power - fine[i], 0.0) * of_gradients, hann.shape) / taper
         areas = ndimage.label(values >= CLIP_SHARE * clip)[0]
-        squares = np.concatenate([np.diff(values, axis=axis).ravel() for axis in (0, 1)]) ** 2
         least = noise[i] + (NON_UNIFORMITY * values.mean()) ** 2 + (clip / DYNAMIC_RANGE) ** 2
         rows.append(
             (
                 information.reshape(BANDS, SECTORS),
-                1.0 if repeats(values) else _period(gradients),
-                _blockiness(values, corner),
+                repeats(power, fine[i], values.shape),
                 np.bincount(areas.ravel())[1:].max(initial=0),
-                np.mean(squares**2) / max(np.mean(squares) ** 2, 1e-30),
                 _evidence(power, evident, least),
             )
         )
@@ -384,53 +277,30 @@ def _evidence(power: NDArray[np.float64], number: NDArray[np.intp], noise: float
     return float(np.log2(1.0 + signal) @ count / count.sum())
 
 
-def _correlation(power: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Autocorrelation of what has a power spectrum, at lags up to a third of the side, 1 in the middle."""
+def periodogram(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Power at the frequencies of `rfft2` under a Hann window, by which white noise has its variance."""
+    hann = np.outer(*(np.hanning(n + 2)[1:-1] for n in values.shape))
+    return np.square(np.abs(fft.rfft2(values * hann))) / np.square(hann).sum()
+
+
+def repeats(power: NDArray[np.float64], noise: float, shape: tuple[int, ...]) -> bool:
+    """Whether what has this periodogram repeats, as a fence does.
+
+    That is so where the autocorrelation of its gradients has a peak near one that a valley of half its height
+    parts from the middle.
+    """
+    square = np.square(2.0 * np.pi * np.hypot(fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])))
+    gradients = np.maximum(power - noise, 0.0) * square * np.exp(-2.0 * square)  # smoothed ones
+    window = periodogram(np.ones(shape))  # its autocorrelation takes weight from long lags
     reach = min(shape) // 3
-    near = tuple(slice(n // 2 - reach, n // 2 + reach + 1) for n in shape)
-    correlation = fft.fftshift(fft.irfft2(power, s=shape))[near]
-    return np.asarray(correlation / max(float(correlation[reach, reach]), 1e-300))
-
-
-@lru_cache(maxsize=4)  # it takes a sixteenth of the second look
-def _lags(reach: int) -> NDArray[np.float64]:
-    """Distance in pixels of the lags of `_correlation` from the middle."""
-    t = np.arange(-reach, reach + 1)
-    return np.hypot(t[:, None], t)
-
-
-def repeats(patch: NDArray[np.floating]) -> bool:
-    """Whether the autocorrelation of a patch falls far below zero and comes back nearly to one: a fence."""
-    waves = fft.rfft2((patch - patch.mean()).astype(np.float64))
-    correlation = _correlation(np.square(np.abs(waves)), patch.shape)
-    reach = min(patch.shape) // 3
-    lag = _lags(reach)
-    valley, peak = (correlation[(lag > core) & (lag < reach)] for core in _CORE_PX)
-    return bool(valley.min() < _REPEATS[0] and peak.max() > _REPEATS[1])
-
-
-def _period(correlation: NDArray[np.float64]) -> float:
-    """Highest peak of an autocorrelation that a valley of half its height parts from the middle."""
-    reach = len(correlation) // 2
-    highest = (correlation == ndimage.maximum_filter(correlation, 3)) & (correlation > 0.0)
-    peaks = np.argwhere(highest & (_lags(reach) >= _MAIN_LOBE_PX))
-    heights = correlation[peaks[:, 0], peaks[:, 1]]
+    near = np.ix_(*(np.arange(n // 2 - reach, n // 2 + reach + 1) for n in shape))
+    correlation, taper = (fft.fftshift(fft.irfft2(part, s=shape))[near] for part in (gradients, window))
+    correlation /= taper * max(correlation[reach, reach] / taper[reach, reach], 1e-300)
+    lags = np.hypot(*np.ogrid[-reach : reach + 1, -reach : reach + 1])
+    highest = (correlation == ndimage.maximum_filter(correlation, 3)) & (correlation > _ALIKE)
     t = np.linspace(0.0, 1.0, _ON_THE_WAY)[:, None]
-    for at in np.argsort(heights)[::-1][:6]:
-        way = np.rint(reach + (peaks[at] - reach) * t).astype(int)
-        if float(correlation[way[:, 0], way[:, 1]].min()) < 0.5 * heights[at]:
-            return min(float(heights[at]), 1.0)
-    return 0.0
-
-
-def _blockiness(values: NDArray[np.float64], corner: tuple[int, int]) -> float:
-    """Mean step across the lines of an 8 px grid over that elsewhere, less what neighbours predict."""
-    ratios = []
-    for start, turned in zip(corner, (values, values.T), strict=True):
-        d = np.abs(np.diff(turned, axis=0))
-        excess = np.abs(d[1:-1] - 0.5 * (d[:-2] + d[2:])).mean(axis=1)
-        # Entry i belongs to the line between pixels i + 1 and i + 2 of the window.
-        phase = (np.arange(excess.size) + 2 + start) % _JPEG_BLOCK
-        by_phase = np.array([excess[phase == k].mean() for k in range(_JPEG_BLOCK)])
-        ratios.append(by_phase[0] / max(float(np.median(by_phase[1:])), 1e-12))
-    return float(np.mean(ratios))
+    for peak in np.argwhere(highest & (lags >= _MAIN_LOBE_PX)):
+        way = np.rint(reach + (peak - reach) * t).astype(int)
+        if correlation[way[:, 0], way[:, 1]].min() < 0.5 * correlation[tuple(peak)]:
+            return True
+    return False

@@ -168,8 +168,7 @@ def test_strips_leave_no_trace_in_the_windows(photo: Plane, monkeypatch: pytest.
     monkeypatch.setattr(windows, "_STRIP_PIXELS", 32 * 400)
     cut = windows_in(photo[:300, :400])
 
-    assert np.isfinite(whole.width).any()
-    for name in ("directions", "eigenvalues", "level", "width", "elongation", "r_mean"):
+    for name in ("directions", "eigenvalues", "level", "r_mean"):
         np.testing.assert_allclose(getattr(cut, name), getattr(whole, name), rtol=1e-5)
 
 
@@ -193,7 +192,7 @@ def test_clipped_flat_and_dark_parts_are_rejected_with_their_reason(scene: Plane
 
 
 @pytest.mark.parametrize(
-    "said", ["one-directional", "periodic", "jpeg-blocks", "more fine detail", "50 x 40 px, a patch needs 64"]
+    "said", ["one-directional", "periodic", "more fine detail", "50 x 40 px, a patch needs 64"]
 )
 def test_a_photo_without_a_usable_window_is_refused_with_the_reason(
     scene: Plane, part: Plane, said: str
@@ -201,11 +200,9 @@ def test_a_photo_without_a_usable_window_is_refused_with_the_reason(
     rng = np.random.default_rng(3)
     rows, cols = np.mgrid[:480, :640]
     stripes = np.repeat(np.cumsum(rng.normal(0, 1, 60)), 12)[None, :].repeat(480, 0)
-    coarse = scene[:480, :640].reshape(60, 8, 80, 8).mean(axis=(1, 3)).repeat(8, 0).repeat(8, 1)
     plane = {
         "one-directional": photo_of((0.5 + 0.3 * np.tanh(stripes / 3)).astype(np.float32)),
         "periodic": photo_of(((rows % 24 < 12) ^ (cols % 30 < 11)).astype(np.float32) * 0.5 + 0.2),
-        "jpeg-blocks": (coarse + part * 0.05).astype(np.float32),
         "more fine detail": rng.normal(0.4, 0.003, (400, 500)).astype(np.float32),
     }.get(said, np.zeros((40, 50), dtype=np.float32))
 

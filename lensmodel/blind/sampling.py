@@ -156,7 +156,6 @@ def find_patches(
         count=count,
         size=size,
         selector=selector,
-        jpeg=developed.lossy,
         coarse_noise=developed.coarse_noise[1],
         on_step=on_step,
     )

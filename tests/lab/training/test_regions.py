@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.training.train_regions import Labelled, _arrays, fit
+from lab.training.train_regions import Labelled, fit
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.patches.good_regions import FEATURES
-
-pytestmark = pytest.mark.slow  # of training, whose library takes a second to import
 
 
 def labelled(count: int, half: str, seed: int) -> list[Labelled]:
@@ -35,25 +33,13 @@ def table(tmp_path: Path) -> Path:
 
 
 def test_training_finds_what_the_similarity_depends_on(table: Path, tmp_path: Path) -> None:
-    pytest.importorskip("sklearn")
     report = fit(table, tmp_path / "model.npz")
 
     assert report["learned"] > 0.8
     assert abs(report["r-map"]) < 0.4  # the r-map scores of this table are random
 
 
-def test_plain_arrays_answer_as_scikit_learn_does() -> None:
-    ensemble = pytest.importorskip("sklearn.ensemble")
-    rng = np.random.default_rng(2)
-    features = rng.normal(size=(300, 6))
-    model = ensemble.GradientBoostingRegressor(n_estimators=30, loss="huber", random_state=0)
-    model.fit(features, features[:, 0] * features[:, 1] + features[:, 2])
-
-    np.testing.assert_allclose(_arrays(model).predict(features), model.predict(features), atol=1e-5)
-
-
 def test_a_table_with_one_half_only_is_refused(tmp_path: Path) -> None:
-    pytest.importorskip("sklearn")
     path = tmp_path / "table.jsonl"
     path.write_text("".join(json.dumps(asdict(row)) + "\n" for row in labelled(16, "dev", 0)))
 

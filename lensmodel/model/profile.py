@@ -77,13 +77,12 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
             f"a profile holds {_MAX_SAMPLES} samples of side {_MAX_SIDE}, not {len(samples)} of side {side}"
         )
     packed = pack_samples(samples)
-    cameras = [asdict(camera) for camera in profile.cameras]
     document = {
         "format": FORMAT,
         "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
         "lens": profile.lens,
         "photos": profile.photos,
-        "cameras": [{key: text for key, text in of.items() if text is not None} for of in cameras],
+        "cameras": [{k: text for k, text in asdict(of).items() if text} for of in profile.cameras],
         "model": {"mode": profile.model.mode},
         "samples": packed.entries,
     }

@@ -8,6 +8,7 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -96,7 +97,7 @@ def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> l
     """All charts of one aperture, that over apertures last."""
     drawn = []
     with mpl.rc_context(_STYLE):
-        for title, draw in [*_panels(report, report.at(aperture), unit), *_by_aperture(report, unit)]:
+        for title, draw in _panels(report, [report.at(aperture)], unit):
             figure, out = Figure(figsize=_CHART, layout="constrained"), io.BytesIO()
             _draw(figure, title, draw)
             figure.savefig(out, format="svg", metadata={"Date": None})
@@ -106,8 +107,7 @@ def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> l
 
 def pages(report: LensReport) -> list[Figure]:
     """Draw what a photographer shows around on one page, and for testers one for each aperture."""
-    panels = [panel for found in report.tested for panel in _panels(report, found, "c/px")]
-    panels += _by_aperture(report, "c/px")
+    panels = _panels(report, report.tested, "c/px")
     with mpl.rc_context(_STYLE):
         drawn = [_photographer(report)]
         for first in range(0, len(panels), _A_PAGE):
@@ -139,23 +139,20 @@ def to_png(figure: Figure) -> bytes:
 # --- what stands where --------------------------------------------------------------------------
 
 
-def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel]:
-    """What a tester is shown of one aperture."""
-    at = _at(found)
-    return [
-        (f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor.units.get(unit, 1.0))),
-        (
-            f"Contrast from the centre to the corner{at}: sagittal (S) solid, tangential (T) dashed",
-            _on(_contrast, found),
-        ),
-        (f"Centring{at}", _on(_side_softer, found)),
-    ]
-
-
-def _by_aperture(report: LensReport, unit: Unit) -> list[Panel]:
-    """What a tester is shown of all apertures together."""
-    several = len(report.apertures) > 1
-    return [("MTF50 by aperture", _on(_over_apertures, report, unit))] if several else []
+def _panels(report: LensReport, tested: Iterable[ApertureReport], unit: Unit) -> list[Panel]:
+    """What a tester is shown of each of some apertures, and at the end of all of them together."""
+    factor = report.sensor.units.get(unit, 1.0)
+    panels: list[Panel] = []
+    for found in tested:
+        at, ways = _at(found), "sagittal (S) solid, tangential (T) dashed"
+        panels += [
+            (f"MTF50 in {_UNITS[unit]}{at}", partial(_maps, found=found, factor=factor)),
+            (f"Contrast from the centre to the corner{at}: {ways}", _on(_contrast, found)),
+            (f"Centring{at}", _on(_side_softer, found)),
+        ]
+    if len(report.apertures) > 1:
+        panels.append(("MTF50 by aperture", _on(_over_apertures, report, unit)))
+    return panels
 
 
 def _on(draw: Callable[..., None], *given: Any) -> Callable[[Place], None]:  # noqa: ANN401 - what it draws

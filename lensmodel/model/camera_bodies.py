@@ -64,20 +64,14 @@ def usual_pitch(samples: Sequence[PsfSample]) -> float | None:
 
 
 def at_pitch(samples: Sequence[PsfSample], pitch_um: float | None) -> list[PsfSample]:
-    """Samples as a body of another pitch would have seen them; those of that pitch stay themselves."""
+    """Samples with the kernels that a body of another pitch would have seen."""
 
     def seen(sample: PsfSample) -> PsfSample:
-        own, half, side = sample.pixel_pitch_um, sample.half_diagonal_px, sample.kernel.shape[0]
+        own, side = sample.pixel_pitch_um, sample.kernel.shape[0]
         if own is None or pitch_um is None or alike(own, pitch_um):
             return sample
         wanted = min(2 * math.ceil(side / 2 * own / pitch_um) + 1, 2 * side + 1)
-        return replace(
-            sample,
-            kernel=rescaled(sample.kernel, own, pitch_um, wanted),
-            encoded=None,  # its statistics are of the other pixels
-            pixel_pitch_um=pitch_um,
-            half_diagonal_px=None if half is None else half * own / pitch_um,
-        )
+        return replace(sample, kernel=rescaled(sample.kernel, own, pitch_um, wanted))
 
     return [seen(sample) for sample in samples]
 

@@ -127,12 +127,6 @@ _INSIDE: Final = _BIN >= 0
 _HANN: Final = np.outer(np.hanning(WINDOW), np.hanning(WINDOW)).astype(np.float32)
 
 
-def _ring_means(spectrum: NDArray[np.complex64]) -> NDArray[np.float32]:
-    """Mean of |F|^2 in each bin."""
-    power = spectrum.real**2 + spectrum.imag**2
-    return (np.bincount(_BIN[_INSIDE], power[_INSIDE]) / _COUNT).astype(np.float32)
-
-
 def _green_everywhere(mosaic: Plane, colours: NDArray[np.int8]) -> Plane:
     """Green at every pixel but those of the border: its sample, else the mean of green neighbours."""
     mask = (colours == 1).astype(np.float32)
@@ -214,7 +208,9 @@ def patch_statistics(
         middle = float((mosaic * weight).sum() / max(float(weight.sum()), _TINY))
         spectrum = scipy.fft.rfft2((mosaic - np.float32(middle)) * weight)
         noise = float((_HANN * weight).sum()) * (read * read + shot * max(mean, 0.0)) + _TINY
-        power = np.maximum(_ring_means(spectrum) - noise, 0.0) + _FLOOR * noise
+        squared = spectrum.real**2 + spectrum.imag**2
+        means = (np.bincount(_BIN[_INSIDE], squared[_INSIDE]) / _COUNT).astype(np.float32)
+        power = np.maximum(means - noise, 0.0) + _FLOOR * noise
         log_power = np.log(power)
         low = float(np.log(power[: _LOW_RINGS * _HALF].mean()))
         powers.append(log_power[: rings * _HALF] - low)

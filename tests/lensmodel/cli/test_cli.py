@@ -448,7 +448,7 @@ def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
 
     kept = load_profile(folder / new).model
     sides = {sample.kernel.shape for sample in kept.samples}
-    assert (result["model"], kept.settings.mode) == ("paper", "paper")
+    assert (result["model"], kept.mode) == ("paper", "paper")
     assert max(sides) <= (21, 21)
     assert json.loads(here(*words, *quick).stdout)["model"] == "paper"
     assert here("correct", "one.dng", "-p", new, "-o", "out").returncode == 0

@@ -37,7 +37,7 @@ import numpy as np
 
 import lensmodel
 from lensmodel.core.types import LensSettings
-from lensmodel.simulate import BlurOptions, SimulatedCamera, draw_lens, load_scene, photograph, write_photo
+from lensmodel.simulate import SimulatedCamera, draw_lens, load_scene, photograph, write_photo
 
 assert "site-packages" in lensmodel.__file__, lensmodel.__file__
 extras = [name for name in ("fastapi", "sqlalchemy", "sklearn", "matplotlib") if find_spec(name)]
@@ -46,11 +46,10 @@ source = Path(sys.argv[1])
 camera = SimulatedCamera(height=384, width=576, pitch_um=9.0)
 true_lens = draw_lens(5, "soft-fast")
 settings = LensSettings(aperture=true_lens.at_focal().f_number)
-options = BlurOptions(pitch_um=camera.pitch_um, step=0.3, size=41)
 for seed, (name, scene, left) in enumerate([("a", "tea-gardens", 400), ("b", "lake", 400), ("c", "city", 500)]):
     whole = load_scene(source / "lensmodel" / "demo_data" / f"{scene}.jpg")
     cut = np.ascontiguousarray(whole[:, 200 : 200 + camera.height + 32, left : left + camera.width + 32])
-    shot = photograph(cut, true_lens, settings, camera, np.random.default_rng(seed), options=options)
+    shot = photograph(cut, true_lens, settings, camera, np.random.default_rng(seed), size=41, step=0.3)
     write_photo(Path(f"{name}.dng"), shot)
 
 lines = re.search(r"```python\n(.*?)```", (source / "docs" / "library.md").read_text(encoding="utf-8"), re.DOTALL)

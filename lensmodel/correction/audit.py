@@ -193,16 +193,12 @@ def _spikes(  # noqa: C901 - one pass over the tile, row by row
                 shown[i, j] = min(x[c, i, j], clip[c])
         for i in range(1, rows - 1):
             above, here, below = shown[i - 1], shown[i], shown[i + 1]
-            number = 0
             for j in range(1, cols - 1):
                 top = max(above[j - 1], above[j], above[j + 1], here[j - 1], here[j + 1])
                 low = min(above[j - 1], above[j], above[j + 1], here[j - 1], here[j + 1])
                 top = max(top, below[j - 1], below[j], below[j + 1])
                 low = min(low, below[j - 1], below[j], below[j + 1])
                 out[j] = max(here[j] - top, low - here[j], zero)
-                number += out[j] * out[j] > least * (shot * max(y[c, i, j], zero) + read)
-            if number == 0:
-                continue
             for j in range(1, cols - 1):
                 variance = max(shot * max(y[c, i, j], zero) + read, np.float32(1e-12))
                 if out[j] * out[j] <= least * variance:
@@ -232,10 +228,15 @@ def _misfit(
         if min(rows, cols) <= 2 * rim:
             continue  # light from beyond reaches all of it
 
-        def spread(plane: Plane, blur: UniformBlur = blur) -> Real:
-            return np.pad(blur.forward(plane), blur.reach)
+        inside = slice(rim, rows - rim), slice(rim, cols - rim)
 
-        counted = np.pad(np.ones((rows - 2 * rim, cols - 2 * rim), dtype=np.float32), rim)
+        def spread(plane: Plane, blur: UniformBlur = blur, inside: Window = inside) -> Real:
+            out = np.zeros(plane.shape, dtype=np.float32)
+            out[inside] = blur.forward(plane)
+            return out
+
+        counted = np.zeros((rows, cols), dtype=np.float32)
+        counted[inside] = 1.0
         if sensor.measured is not None:
             counted *= sensor.measured
         clipped = y[c] >= np.float32(LEAST_CLIPPED * sensor.clip)

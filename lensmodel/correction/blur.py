@@ -199,27 +199,20 @@ class UniformBlur:
             raise InvalidInputError(
                 f"a latent plane of {latent.shape} leaves no frame inside a kernel that reaches {cut}"
             )
-        work, scratch, K = self._canvas(latent.shape)
-        work[:height, :width] = latent
-        through(work, scratch, K, forward=True, first=0, last=height, begin=cut, end=height - cut)
-        return np.ascontiguousarray(work[cut : height - cut, cut : width - cut])
+        return self._applied(latent, (height, width), FORWARD, 0, cut)
 
     def adjoint(self, blurred: Plane) -> Plane:
         """Correlation of y with k on the latent plane: `(h, ...)` to `(h + k - 1, ...)`, float32."""
-        cut = self.reach
-        height, width = (extent + 2 * cut for extent in blurred.shape)
-        work, scratch, K = self._canvas((height, width))
-        work[cut : height - cut, cut : width - cut] = blurred
-        through(work, scratch, K, forward=False, first=cut, last=height - cut, begin=0, end=height)
-        return np.ascontiguousarray(work[:height, :width])
+        cut, (height, width) = self.reach, blurred.shape
+        return self._applied(blurred, (height + 2 * cut, width + 2 * cut), BACK, cut, 0)
 
-    def _canvas(
-        self, shape: tuple[int, ...]
-    ) -> tuple[NDArray[np.float32], NDArray[np.complex64], NDArray[np.complex64]]:
-        """An empty plane that is quick to transform, room for its spectrum, the transfer function."""
-        grid = fast_shape(shape)
-        K = self.spectrum(grid)
-        return np.zeros(grid, dtype=np.float32), np.empty_like(K), K
+    def _applied(self, plane: Plane, shape: tuple[int, int], forward: bool, margin: int, cut: int) -> Plane:
+        """Blur a plane within a latent one of this shape, or do what is adjoint to that; cut the rim off."""
+        K, (height, width) = self.spectrum(fast_shape(shape)), shape
+        work = np.zeros(fast_shape(shape), dtype=np.float32)
+        work[margin : height - margin, margin : width - margin] = plane
+        through(work, np.empty_like(K), K, forward, margin, height - margin, cut, height - cut)
+        return np.ascontiguousarray(work[cut : height - cut, cut : width - cut])
 
     def frame(self, latent: Plane) -> Plane:
         """Return the part of the latent plane that the photo shows."""
@@ -276,9 +269,12 @@ def transfers(
     rates = np.empty((len(drifts), 2, *K.shape[1:]), dtype=np.complex64)
     for spectrum, rate, drift in zip(K, rates, drifts, strict=bool(drifts)):
         for out, (before, after, pixels) in zip(rate, (drift.down, drift.across), strict=True):
-            side = max(2 * blur.reach + 1 for blur in (before, after))
-            first, last = (np.pad(blur.taps, side // 2 - blur.reach) for blur in (before, after))
-            transfer((last - first) / np.float32(max(pixels, 1.0)), out, shape[1])
+            wide = max(before.reach, after.reach)
+            taps = np.zeros((2 * wide + 1, 2 * wide + 1), dtype=np.float32)
+            for blur, factor in ((before, -1.0), (after, 1.0)):
+                inside = slice(wide - blur.reach, wide + blur.reach + 1)
+                taps[inside, inside] += np.float32(factor / max(pixels, 1.0)) * blur.taps
+            transfer(taps, out, shape[1])
         change = np.float32(reach) * np.abs(rate).sum(axis=0)
         most = np.float32(0.5) * np.abs(spectrum)
         np.multiply(rate, np.minimum(most / np.maximum(change, np.float32(1e-9)), ONE), out=rate)

@@ -14,7 +14,7 @@ from lensmodel.patches.windows import Details, Windows
 
 MODEL: Final = Path(__file__).parent / "data" / "good_regions.npz"
 
-FEATURES: Final = 29  # columns that `features_of` makes
+FEATURES: Final = 27  # columns that `features_of` makes
 
 
 def features_of(windows: Windows, looked: Details) -> NDArray[np.float64]:
@@ -27,15 +27,11 @@ def features_of(windows: Windows, looked: Details) -> NDArray[np.float64]:
     def log(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.log10(np.maximum(values, 1e-3))
 
-    share = windows.directions / np.maximum(windows.directions.sum(axis=1, keepdims=True), 1e-9)
-    entropy = -(share * np.log(np.maximum(share, 1e-9))).sum(axis=1)
     bands = looked.information / np.log(10.0)
     by_band = np.stack([bands.mean(axis=2), bands.min(axis=2), bands.max(axis=2), bands.std(axis=2)], axis=2)
     columns = [
         log(np.sort(windows.directions, axis=1)).T,
-        entropy,
         log(windows.eigenvalues).T,
-        windows.eigenvalues[:, 0] / np.maximum(windows.eigenvalues[:, 1], 1e-9),
         log(windows.contrast),
         windows.level,
         log(windows.level / windows.sigma),

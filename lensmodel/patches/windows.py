@@ -219,7 +219,9 @@ class Details(NamedTuple):
     information: NDArray[np.float64]  # (n, BANDS, SECTORS), natural logarithm of mean power over noise
     periodic: NDArray[np.bool_]  # (n,), whether it `repeats`
     blob: NDArray[np.int64]  # (n,), pixels of the largest connected clipped area
-    evidence: NDArray[np.float64]  # (n,), bits a frequency between 0.1 and 0.4 cycles/pixel; 0 for noise
+    # (n,), bits a frequency, log2(1 + signal / noise), between 0.1 and 0.4 cycles/pixel; 0 for noise:
+    # C. E. Shannon, "Communication in the presence of noise", Proc. IRE 37, 1949
+    evidence: NDArray[np.float64]
 
 
 def details_of(plane: Plane, windows: Windows, clip: float, coarse: NoiseModel | None = None) -> Details:
@@ -236,13 +238,14 @@ def details_of(plane: Plane, windows: Windows, clip: float, coarse: NoiseModel |
         power = periodogram(detrended)
         information = np.log(np.maximum(_means(power, bands)[0] / max(fine[i], 1e-12), 1e-3))
         areas = ndimage.label(values >= CLIP_SHARE * clip)[0]
+        mean, count = _means(power, evident)
         least = noise[i] + (NON_UNIFORMITY * values.mean()) ** 2 + (clip / DYNAMIC_RANGE) ** 2
         rows.append(
             (
                 information.reshape(BANDS, SECTORS),
                 repeats(power, fine[i], values.shape),
                 np.bincount(areas.ravel())[1:].max(initial=0),
-                _evidence(power, evident, least),
+                np.log2(1.0 + np.maximum(mean / max(least, 1e-30) - 1.0, 0.0)) @ count / count.sum(),
             )
         )
     return Details(*(np.array(column) for column in zip(*rows, strict=True)))
@@ -265,16 +268,6 @@ def _means(
     inside = number >= 0
     count = np.bincount(number[inside])
     return np.bincount(number[inside], power[inside]) / np.maximum(count, 1), count
-
-
-def _evidence(power: NDArray[np.float64], number: NDArray[np.intp], noise: float) -> float:
-    """Bits a frequency: mean of log2(1 + max(P / N - 1, 0)) over the bands and sectors that blur empties.
-
-    Source: C. E. Shannon, "Communication in the presence of noise", Proc. IRE 37, 1949.
-    """
-    mean, count = _means(power, number)
-    signal = np.maximum(mean / max(noise, 1e-30) - 1.0, 0.0)
-    return float(np.log2(1.0 + signal) @ count / count.sum())
 
 
 def periodogram(values: NDArray[np.floating]) -> NDArray[np.float64]:

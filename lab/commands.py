@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from lensmodel.cli.console import Display, Force, UsageError
+from lensmodel.cli.console import Display, Force, UsageError, clock
 from lensmodel.cli.files import as_usage, refuse_existing
 from lensmodel.core.types import StepHook
 
@@ -74,8 +74,8 @@ def gallery(
 
 def told(shown: Display, began: float) -> Callable[[str, int, int], None]:
     """Return what tells how much of long work is done."""
-    return lambda words, done, total: shown.progress_line(
-        f"{done} of {total} finished, {words}", time.monotonic() - began
+    return lambda words, done, total: shown.note(
+        f"[{clock(time.monotonic() - began)}] {done} of {total} finished, {words}"
     )
 
 

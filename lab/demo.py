@@ -28,7 +28,7 @@ from app.schemas import CorrectionOut, JobOut, PhotoOut
 from lab.images import Picture, ZoneSharpness, as_shown, by_zone, fidelity, measure_edges, side_by_side
 from lab.kernels import distance
 from lab.scenes import photograph_of
-from lensmodel.cli.console import Display, UsageError
+from lensmodel.cli.console import Display, UsageError, clock
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import ZONE_WORDS, ZONES, FieldPosition, LensSettings, Planes, Zone, zone_of
 from lensmodel.photo import develop
@@ -77,7 +77,7 @@ def demo(
     shown = Display()
     _refuse_what_others_wrote(output, force=force)
     began = time.monotonic()
-    improved = run(output, lambda text: shown.progress_line(text, time.monotonic() - began))
+    improved = run(output, lambda text: shown.note(f"[{clock(time.monotonic() - began)}] {text}"))
     shown.result((output / "report.md").read_text(encoding="utf-8"))
     if not improved:
         shown.error("the corrected photo did not become better; see the report")

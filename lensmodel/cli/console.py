@@ -98,11 +98,6 @@ class Display:
         if self.verbose:
             self.note(text)
 
-    def progress_line(self, text: str, seconds: float) -> None:
-        """Tell a step of long work, with the time since its start, on standard error."""
-        if not self.quiet:
-            typer.echo(f"[{clock(seconds)}] {text}", err=True)
-
     def error(self, text: str) -> None:
         """Tell what went wrong."""
         typer.echo(f"lensmodel: {text}", err=True)

@@ -426,7 +426,7 @@ def test_demo_renews_what_an_earlier_demo_left_and_no_folder_of_others_unless_fo
     first, second = here("demo", "-o", "out"), here("demo", "-o", "out")
     assert first.returncode == second.returncode == 0
     assert second.stdout.strip() == "run 2"
-    assert first.stderr.splitlines() == ["[0:00:00] working"]
+    assert first.stderr.splitlines() == ["lensmodel: [0:00:00] working"]
 
     (folder / "out" / "mine.txt").write_text("my notes", encoding="utf-8")
     refused = here("demo", "-o", "out")

@@ -65,15 +65,15 @@ def test_the_five_lines_run(photos: Path, monkeypatch: pytest.MonkeyPatch, estim
 @pytest.mark.slow
 def test_every_block_of_the_page_runs(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(photos)
-    known = {name: dict(registry.entries) for name, registry in _registries().items()}
+    known = {name: dict(registry) for name, registry in _registries().items()}
     names: dict[str, Any] = {"__name__": "__main__"}
     try:
         for number, block in enumerate(BLOCKS):
             exec(compile(block, f"library.md, block {number}", "exec"), names)
     finally:
         for name, registry in _registries().items():
-            for entry in set(registry.entries) - set(known[name]):
-                registry.entries.pop(entry)  # type: ignore[attr-defined]
+            for entry in set(registry) - set(known[name]):
+                registry.pop(entry)
 
     assert len(BLOCKS) == PAGE.read_text(encoding="utf-8").count("```python") > 5
     assert names["kernel"].shape == (55, 55)

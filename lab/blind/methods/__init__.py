@@ -22,7 +22,7 @@ class BlindMethod(Protocol):
 
 
 compared: Final[Registry[BlindMethod]] = Registry(
-    "estimator", {**estimators.entries, "cho-lee": ChoLee, "sun": Sun, "xu-jia": XuJia, "zhang": Zhang}
+    "estimator", {**estimators, "cho-lee": ChoLee, "sun": Sun, "xu-jia": XuJia, "zhang": Zhang}
 )
 
 __all__ = ["BlindMethod", "ChoLee", "Sun", "XuJia", "Zhang", "compared"]

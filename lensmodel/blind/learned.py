@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.blind.estimator import PsfEstimate, confidence_of, finished, usable
-from lensmodel.core.psf import EncodedPatch, PatchKind, PsfSample, centred, resized
+from lensmodel.core.psf import EncodedPatch, PatchKind, PsfSample, centred, resized, support_radius
 from lensmodel.core.types import (
     CHANNELS,
     FieldPosition,
@@ -81,7 +81,8 @@ class LearnedEstimator:
             # what the network says of the place of a patch from that patch alone
             alone = network.memory(token[None].astype(np.float32), place[None], conditions)
             answer = network.query(alone, place, conditions)
-            side = _side(answer.kernels, size)
+            held = 2 * max(support_radius(kernel, _HELD) for kernel in answer.kernels) + 1
+            side = min(max(held, _LEAST_SIDE), size, answer.kernels.shape[-1])
             for channel, kernel, error in zip(CHANNELS, answer.kernels, answer.error, strict=True):
                 samples.append(
                     PsfSample(
@@ -146,13 +147,3 @@ def _middle(plane: Plane) -> Plane:
     padded = np.pad(plane, [(short // 2, short - short // 2) for short in missing], "symmetric")
     top, left = ((side - WINDOW) // 2 for side in padded.shape)
     return np.ascontiguousarray(padded[top : top + WINDOW, left : left + WINDOW], dtype=np.float32)
-
-
-def _side(kernels: NDArray[np.float64], most: int) -> int:
-    """Odd side that holds nearly all light of kernels."""
-    whole = kernels.shape[-1]
-    for side in range(_LEAST_SIDE, min(whole, most), 2):
-        cut = (whole - side) // 2
-        if kernels[:, cut : cut + side, cut : cut + side].sum(axis=(1, 2)).min() >= _HELD:
-            return side
-    return min(whole, most)

@@ -51,6 +51,20 @@ def resized(kernel: Kernel, size: int) -> Kernel:
     return as_kernel(kernel[cut : cut + size, cut : cut + size] if cut >= 0 else np.pad(kernel, -cut))
 
 
+def support_radius(kernel: Kernel, energy: float = 0.999) -> int:
+    """Half side, in pixels, of the centred square that holds a share `energy` of the kernel's sum."""
+    middle = kernel.shape[0] // 2
+    t = np.abs(np.arange(kernel.shape[0]) - middle)
+    ring = np.maximum(t[:, None], t[None, :])
+    held = np.cumsum(np.bincount(ring.ravel(), weights=kernel.ravel()))
+    return int(np.searchsorted(held, energy * held[-1]))
+
+
+def crop_to_support(kernel: Kernel, energy: float = 0.999) -> Kernel:
+    """Cut a kernel to what holds a share `energy` of its sum; the sum is 1 again."""
+    return resized(kernel, 2 * support_radius(kernel, energy) + 1)
+
+
 def centroid(kernel: npt.NDArray[np.float64]) -> tuple[float, float]:
     """Centre of mass `(row, col)` relative to the middle pixel, in pixels."""
     t = np.arange(kernel.shape[0]) - kernel.shape[0] // 2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lensmodel.correction.blur import crop_to_support
+from lensmodel.core.psf import crop_to_support
 from lensmodel.correction.cell import Roi
 from lensmodel.correction.deconvolver import Deconvolver, Sensor, restore_planes
 from lensmodel.correction.limit import Bounds, StoredColour

@@ -18,7 +18,7 @@ from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
-from lensmodel.core.psf import as_kernel, resized
+from lensmodel.core.psf import as_kernel, support_radius
 from lensmodel.core.types import Kernel, Plane, Planes
 
 Real = NDArray[np.float32]
@@ -240,20 +240,6 @@ def _moved(side: int, shift: float, reach: int) -> NDArray[np.float64]:
 def fast_shape(shape: tuple[int, ...]) -> tuple[int, int]:
     """Return the smallest size not below `shape` that transforms quickly."""
     return int(fft.next_fast_len(shape[0], real=True)), int(fft.next_fast_len(shape[1], real=True))
-
-
-def support_radius(kernel: Kernel, energy: float = 0.999) -> int:
-    """Half side, in pixels, of the centred square that holds a share `energy` of the kernel's sum."""
-    middle = kernel.shape[0] // 2
-    t = np.abs(np.arange(kernel.shape[0]) - middle)
-    ring = np.maximum(t[:, None], t[None, :])
-    held = np.cumsum(np.bincount(ring.ravel(), weights=kernel.ravel()))
-    return int(np.searchsorted(held, energy * held[-1]))
-
-
-def crop_to_support(kernel: Kernel, energy: float = 0.999) -> Kernel:
-    """Cut a kernel to what holds a share `energy` of its sum; the sum is 1 again."""
-    return resized(kernel, 2 * support_radius(kernel, energy) + 1)
 
 
 def transfers(

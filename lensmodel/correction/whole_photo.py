@@ -16,7 +16,7 @@ from numba.core import event
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
-from lensmodel.core.psf import PsfField
+from lensmodel.core.psf import PsfField, crop_to_support
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import (
     CHANNELS,
@@ -32,7 +32,7 @@ from lensmodel.core.types import (
     ignore_step,
 )
 from lensmodel.correction.audit import Audit
-from lensmodel.correction.blur import Real, UniformBlur, crop_to_support
+from lensmodel.correction.blur import Real, UniformBlur
 from lensmodel.correction.cell import (
     Cell,
     CorrectionJob,

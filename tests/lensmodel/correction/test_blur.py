@@ -7,9 +7,9 @@ from scipy import signal
 
 from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import as_kernel, delta
+from lensmodel.core.psf import as_kernel, crop_to_support, delta, support_radius
 from lensmodel.core.types import Kernel
-from lensmodel.correction.blur import Drift, UniformBlur, crop_to_support, support_radius, transfers
+from lensmodel.correction.blur import Drift, UniformBlur, transfers
 
 
 def kernels(side: int = 7) -> st.SearchStrategy[np.ndarray]:

@@ -65,7 +65,8 @@ def test_tangential_and_sagittal_are_not_mixed(chart: tuple[LinearPhoto, tuple[S
     tangential, sagittal, apart = [], [], []
     for psf in psfs:
         phi = psf.position.phi
-        true = truth(photo, psf.pixel, phi), truth(photo, psf.pixel, phi + math.pi / 2)
+        pixel = photo.frame.pixel(psf.position)
+        true = truth(photo, pixel, phi), truth(photo, pixel, phi + math.pi / 2)
         seen = [min(value, 0.5) for value in tangential_sagittal_mtf50(psf.kernel, phi)]
         tangential.append(seen[0] / true[0] - 1.0)
         sagittal.append(seen[1] / true[1] - 1.0)

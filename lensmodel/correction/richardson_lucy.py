@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final, TypeAlias
+from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,13 @@ from lensmodel.correction.blur import (
 )
 from lensmodel.correction.deconvolver import Sensor
 
+Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
+"""How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""
+
 _Response: TypeAlias = tuple[Real, Number, Number]
 
-_ALPHA_MAX: Final = 0.9  # of the extrapolation; above it the noise is accelerated as well
+_ACCELERATIONS: Final = get_args(Acceleration)
+_ALPHA_MAX: Final = 0.9  # of the fixed extrapolation; above it the noise is accelerated as well
 _SHARPNESS: Final = 50.0  # a of the sensor response: it bends over a tenth of the clipping level (chosen)
 _REACH_FLOOR: Final = 0.05
 """Share of the largest F^T 1, the least to divide by (chosen: less lets noise explode, more darkens rims)."""
@@ -63,20 +67,27 @@ class SaturationAwareRichardsonLucy:
         u_U = 1 + F^T(e V),   u_S = 1 + F^T e,   x <- x max( u_U + (u_S - u_U) w, 0 )
 
     with V = 0 wherever a pixel of S reaches and w the softened S. Before each step the estimate
-    is extrapolated, after D. S. C. Biggs and M. Andrews, "Acceleration of iterative image restoration
-    algorithms", Applied Optics 36, 1766-1775, 1997, but by a fixed schedule: one measured tile by tile
-    would let the result depend on where the tiles lie::
+    is extrapolated, y_k = x_k + alpha_k (x_k - x_{k-1}), by one of two schedules::
 
-        y_k = x_k + alpha_k (x_k - x_{k-1}),    alpha_k = (k - 1) / (k + 2), at most 0.9
+        fixed      alpha_k = (k - 1) / (k + 2), at most 0.9
+        adaptive   alpha_k = <g_{k-1}, g_{k-2}> / <g_{k-2}, g_{k-2}>, within 0..1,   g_k = x_{k+1} - y_k
+
+    The second is that of D. S. C. Biggs and M. Andrews, "Acceleration of iterative image restoration
+    algorithms", Applied Optics 36, 1766-1775, 1997. It measures alpha tile by tile, so the result depends a
+    little on where the tiles lie.
     """
 
     iterations: int = 25
-    accelerated: bool = True
+    acceleration: Acceleration = "fixed"
     warped: bool = False  # whether lateral colour is removed by resampling before, not as part of the kernels
 
     def __post_init__(self) -> None:
         if not 1 <= self.iterations <= 500:
             raise InvalidInputError(f"iterations must lie in 1..500, got {self.iterations}")
+        if self.acceleration not in _ACCELERATIONS:
+            raise InvalidInputError(
+                f"acceleration must be one of {', '.join(_ACCELERATIONS)}, got {self.acceleration!r}"
+            )
 
     def deconvolve(self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor) -> Plane:
         """Deconvolve one plane; see `Deconvolver`."""
@@ -84,7 +95,7 @@ class SaturationAwareRichardsonLucy:
         lights = bool(blurred.max() >= _LIGHT * sensor.clip)
         return blur.frame(
             richardson_lucy_steps(
-                latent, blurred, reach, blur, sensor, self.iterations, self.accelerated, lights=lights
+                latent, blurred, reach, blur, sensor, self.iterations, self.acceleration, lights=lights
             )
         )
 
@@ -108,7 +119,7 @@ def richardson_lucy_steps(
     blur: UniformBlur,
     sensor: Sensor,
     steps: int,
-    accelerated: bool = True,
+    acceleration: Acceleration = "fixed",
     *,
     lights: bool = False,
 ) -> Plane:
@@ -119,7 +130,7 @@ def richardson_lucy_steps(
     base = _background(sensor)
     data: Plane = np.ascontiguousarray(np.maximum(blurred, 0.0) + base, dtype=np.float32)
     count = np.arange(1, steps + 1)
-    alphas = np.minimum((count - 1) / (count + 2), _ALPHA_MAX) * accelerated
+    fixed = np.minimum((count - 1) / (count + 2), _ALPHA_MAX) * (acceleration == "fixed")
     shape = fast_shape(latent.shape)
     latent = np.array(latent, dtype=np.float32, order="C")
     _steps(
@@ -130,7 +141,8 @@ def richardson_lucy_steps(
         np.float32(base),
         np.float32(sensor.clip),
         _response(),
-        alphas.astype(np.float32),
+        fixed.astype(np.float32),
+        acceleration == "adaptive",
         shape[1],
         lights,
     )
@@ -238,6 +250,27 @@ def _errors(light: Real, data: Real, base: Number, clip: Number, response: _Resp
 
 
 @jit
+def _measured_alpha(start: Real, work: Real, share: Real, change: Real) -> Number:
+    """Measure alpha of Biggs and Andrews; `change` holds that of the step before, then that of this one."""
+    rows, cols = start.shape
+    norm = 0.0
+    product = 0.0
+    for i in range(rows):
+        row_product, row_norm = np.float64(0.0), np.float64(0.0)
+        for j in range(cols):
+            light = max(start[i, j] * max(ONE + work[i, j] * share[i, j], ZERO), _TINY)
+            now, before = light - start[i, j], change[i, j]
+            row_product += now * before
+            row_norm += before * before
+            change[i, j] = now
+        product += row_product
+        norm += row_norm
+    if not norm > 0.0:
+        return ZERO
+    return np.float32(min(max(product / norm, 0.0), 1.0))
+
+
+@jit
 def _steps(  # noqa: C901 - one pass over memory per loop
     latent: Real,
     data: Real,
@@ -247,13 +280,15 @@ def _steps(  # noqa: C901 - one pass over memory per loop
     clip: Number,
     response: _Response,
     alphas: Real,
+    adaptive: bool,
     width: int,
     lights: bool,
 ) -> None:
     """Accelerated saturation-aware steps; `latent` is start and result.
 
     The transforms live on the grid of `K`, `width` columns wide; the latent plane lies in its
-    first corner, the data in the middle of the latent plane.
+    first corner, the data in the middle of the latent plane. With `adaptive` the extrapolation of each
+    step is measured on the changes of the two before it, and `alphas` only gives their number.
     """
     rows, cols = latent.shape
     high, wide = data.shape
@@ -268,6 +303,7 @@ def _steps(  # noqa: C901 - one pass over memory per loop
     share = ONE / reach
     clean = np.empty_like(data)
     soft = np.empty_like(latent)
+    change = np.zeros_like(latent) if adaptive else soft
     for step in range(steps):
         through(work, P, K, FORWARD, 0, rows, top, bottom)
         for i in range(high):
@@ -287,6 +323,8 @@ def _steps(  # noqa: C901 - one pass over memory per loop
                 for j in range(cols):
                     work[i, j] = calm[i, j] + (work[i, j] - calm[i, j]) * soft[i, j]
         alpha = alphas[step + 1] if step + 1 < steps else ZERO
+        if adaptive:
+            alpha = _measured_alpha(start, work, share, change)
         for i in range(rows):
             for j in range(cols):
                 light = max(start[i, j] * max(ONE + work[i, j] * share[i, j], ZERO), _TINY)

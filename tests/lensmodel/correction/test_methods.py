@@ -21,7 +21,7 @@ from lensmodel.correction import (
     restore_planes,
 )
 from lensmodel.correction.blur import UniformBlur
-from lensmodel.correction.richardson_lucy import Lights
+from lensmodel.correction.richardson_lucy import Acceleration, Lights, first_guess
 from lensmodel.correction.sparse_gradient import shrink, shrinkage
 
 CLEAN = Sensor(NoiseModel(1e-7, 1e-8))
@@ -188,6 +188,7 @@ def test_method_answers_float32_of_the_frame_is_repeatable_and_leaves_its_input_
     [
         (SaturationAwareRichardsonLucy, {"iterations": 0}, "iterations"),
         (SaturationAwareRichardsonLucy, {"iterations": 501}, "iterations"),
+        (SaturationAwareRichardsonLucy, {"acceleration": "fast"}, "fixed, adaptive, none"),
         (SparseGradient, {"weight": 0.0}, "positive"),
     ],
 )
@@ -204,9 +205,7 @@ def test_richardson_lucy_raises_the_likelihood_with_every_step() -> None:
     sensor = Sensor(NoiseModel(1 / 500, 0.0))
     scores = []
     for steps in (1, 2, 4, 8, 16):
-        plane = SaturationAwareRichardsonLucy(steps, accelerated=False).deconvolve(
-            counts, blur, sensor=sensor
-        )
+        plane = SaturationAwareRichardsonLucy(steps, "none").deconvolve(counts, blur, sensor=sensor)
         # The frame of the estimate is all that is returned; inside it the prediction is complete.
         predicted = np.maximum(blur.forward(plane), 1e-6)
         seen = blur.frame(counts)
@@ -219,7 +218,7 @@ def test_richardson_lucy_equals_scikit_image_inside_at_equal_start() -> None:
     sharp, kernel = scene(150, 150), gaussian(7, np.eye(2))
     blur = UniformBlur(kernel)
     blurred = np.maximum(blur.forward(sharp), 1e-3)
-    plain = SaturationAwareRichardsonLucy(6, accelerated=False)
+    plain = SaturationAwareRichardsonLucy(6, "none")
     ours = plain.deconvolve(blurred, blur, sensor=Sensor(NoiseModel(1e-4, 0.0)))
     # scikit-image starts from a constant; ours from one back-projection, which is its first step
     # up to the constant: x1 = 0.5 k~ * (y / 0.5) = k~ * y.
@@ -228,13 +227,37 @@ def test_richardson_lucy_equals_scikit_image_inside_at_equal_start() -> None:
     np.testing.assert_allclose(ours[30:-30, 30:-30], theirs[30:-30, 30:-30], atol=1e-4)
 
 
-def test_acceleration_is_worth_three_times_the_steps() -> None:
+@pytest.mark.parametrize("acceleration", ["fixed", "adaptive"])
+def test_acceleration_is_worth_three_times_the_steps(acceleration: Acceleration) -> None:
     sharp, blur = scene(128, 128), UniformBlur(gaussian(15, np.eye(2) * 4))
     blurred, truth = blur.forward(sharp), blur.frame(sharp)
-    fast, slow = SaturationAwareRichardsonLucy(20), SaturationAwareRichardsonLucy(60, accelerated=False)
+    fast, slow = SaturationAwareRichardsonLucy(20, acceleration), SaturationAwareRichardsonLucy(60, "none")
 
     found = [rmse(m.deconvolve(blurred, blur, sensor=CLEAN), truth) for m in (fast, slow)]
     assert found[0] <= found[1]
+
+
+def test_measured_acceleration_is_biggs_and_andrews_own() -> None:
+    sharp, kernel = scene(60, 60), gaussian(9, np.eye(2) * 2)
+    blur = UniformBlur(kernel)
+    blurred = np.maximum(blur.forward(sharp), 1e-3)
+    sensor = Sensor(NoiseModel(1e-4, 0.0), clip=np.inf)
+
+    # eqs. (4) to (7), written down a second time, over plain Richardson-Lucy steps
+    latent, reach = first_guess(blurred, blur)
+    previous, changes = latent, []
+    for _ in range(8):
+        alpha = 0.0
+        if len(changes) > 1:
+            alpha = float(np.sum(changes[-1] * changes[-2]) / np.sum(changes[-2] ** 2))
+        start = np.maximum(latent + np.clip(alpha, 0.0, 1.0) * (latent - previous), 1e-6)
+        ratio = blurred / np.maximum(blur.forward(start), 1e-6)
+        previous, latent = latent, start * np.maximum(1.0 + blur.adjoint(ratio - 1.0) / reach, 0.0)
+        changes.append((latent - start).astype(np.float64))
+
+    method = SaturationAwareRichardsonLucy(8, acceleration="adaptive")
+    found = method.deconvolve(blurred, blur, sensor=sensor)
+    np.testing.assert_allclose(found, blur.frame(latent), rtol=2e-4, atol=2e-5)
 
 
 def test_clipped_lights_do_not_ring_into_their_neighbours() -> None:

@@ -362,7 +362,8 @@ class _Posteriors:
         kernel = np.mean(kernels, axis=0)
         apart = max(np.linalg.norm(each - kernel) for each in kernels) / np.linalg.norm(kernel)
         error = math.hypot(max(errors), apart)
-        return correction.PsfPosterior.of_error(correction.crop_to_support(kernel), error)
+        rings = answer.ring_error if len(self.turns) == 1 else None
+        return correction.PsfPosterior.of_error(correction.crop_to_support(kernel), error, rings)
 
 
 def _method_of(

@@ -18,6 +18,7 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import otf
@@ -37,10 +38,12 @@ class PsfPosterior:
     error: float  # expected relative L2 distance of the true kernel from the mean
 
     @classmethod
-    def of_error(cls, kernel: Kernel, error: float) -> PsfPosterior:
-        """A kernel of which only the relative L2 error e is known: most likely its width is wrong.
+    def of_error(cls, kernel: Kernel, error: float, rings: NDArray[np.float64] | None = None) -> PsfPosterior:
+        """A kernel of which the relative L2 error e is known: most likely its width is wrong.
 
-        Var[H] = e² |H|² ln²|H| sum |H|² / sum |H|² ln²|H|, as an error of the width makes.
+        Var[H] = e² |H|² ln²|H| sum |H|² / sum |H|² ln²|H|, as an error of the width makes. It is no more than
+        the square of the error that is expected at a frequency, where its r.m.s. in eight `rings` up to .5
+        cycles/pixel is known; below the middle of the first it falls as |f|².
         """
         if not (math.isfinite(error) and error >= 0.0):
             raise InvalidInputError(f"psf_error must be finite and not negative, got {error}")
@@ -52,7 +55,13 @@ class PsfPosterior:
         times = np.full(power.shape, 2.0)  # how often each column of the half spectrum stands in the whole
         times[:, [0, -1]] = 1.0
         scale = error**2 * float((times * power).sum()) / max(float((times * shape).sum()), _LEAST)
-        return cls(kernel, (scale * shape).astype(np.float32), error)
+        variance = scale * shape
+        if rings is not None:
+            f = np.hypot(fft.fftfreq(GRID[0])[:, None], fft.rfftfreq(GRID[1]))
+            middles = (np.arange(len(rings)) + 0.5) / (2 * len(rings))
+            known = np.interp(f, middles, rings) * np.minimum(f / middles[0], 1.0) ** 2
+            variance = np.minimum(variance, known**2)
+        return cls(kernel, variance.astype(np.float32), error)
 
 
 @runtime_checkable

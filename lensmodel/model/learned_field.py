@@ -31,6 +31,7 @@ _CELL: Final = np.array([0.25, 0.25, 1.0 / 3.0, 0.25, 0.5]) / query.UNITS
 _MEMORIES: Final = 64  # neighbourhoods whose keys are kept (chosen: a whole picture's, a megabyte each)
 _ANSWERS: Final = 64  # that are kept: of all channels, which are asked for one after the other (chosen)
 _ROW_BYTES: Final = 200  # of a patch besides its token: place, settings, its part of the tree
+_RINGS: Final = (np.arange(8) + 0.5) / 16.0  # cycles/pixel, of the errors that the network tells
 _KEY_BYTES: Final = 4608  # of a patch: keys and values of three attentions, 192 floats each
 
 
@@ -73,13 +74,14 @@ class LearnedField:
         """Answer at a place, in pixels of some pitch."""
         answer, rows, own = self._answer(position, settings.with_channel("g"), pitch_um)
         channel = CHANNELS.index(settings.channel)
+        scale = own / pitch_um if own is not None and pitch_um is not None else 1.0
         return Part(
             centred(camera_bodies.rescaled(answer.kernels[channel], own, pitch_um, size)),
             min(float(answer.error[channel]), 1.0),
             np.asarray(answer.weights, dtype=np.float64),
             self._photos[rows],
             query.nearest(self._where[rows], query.in_units(position, settings)),
-            np.asarray(answer.ring_error[channel], dtype=np.float64),
+            np.interp(scale * _RINGS, _RINGS, answer.ring_error[channel]),
         )
 
     def _answer_of(

@@ -17,6 +17,7 @@ from lensmodel.core.types import LensSettings
 from lensmodel.report import (
     EXPORTERS,
     LensReport,
+    compare,
     filled_aspect,
     lens_report,
     provenance,
@@ -42,6 +43,7 @@ def report(
         ),
     ] = None,
     aperture: Aperture = None,
+    against: Annotated[Path | None, typer.Option(help="Profile of another copy to compare with.")] = None,
     force: console.Force = False,
 ) -> None:
     """Say how sharp a lens is, and whether it is centred.
@@ -56,19 +58,22 @@ def report(
 
         lensmodel report my-24mm.lensprofile -o my-24mm.pdf
 
+        lensmodel report my-24mm.lensprofile --against a-friends-24mm.lensprofile
+
     Exit status: 0 reported, 1 the profile cannot be used, 2 wrong usage.
     """
     shown, targets = Display(), _targets(output)
     files.refuse_existing(*targets, force=force)
     with shown.progress("computing its PSFs at 200 places"):
         found = measured(profile, aperture)
+        compared = [] if against is None else [compare(found, measured(against, aperture))]
     if output is not None:
         with shown.progress("drawing"):
             for target in targets:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(target, _written(found, target.suffix.lower()))
     at = found.tested[0].at or "unknown aperture"
-    lines = [f"{found.name}: {found.facts}; {at}", *(f"- {line}" for line in found.summary)]
+    lines = [f"{found.name}: {found.facts}; {at}", *(f"- {line}" for line in (*found.summary, *compared))]
     shown.result("\n".join([*lines, *([] if output is None else [f"written: {output}"])]))
 
 

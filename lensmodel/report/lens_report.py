@@ -487,6 +487,17 @@ def _frequencies(pitch_um: float | None) -> list[tuple[float, float | None]]:
     return [(f, lp) for f, lp in pairs if f <= NYQUIST]
 
 
+def compare(first: LensReport, second: LensReport) -> str:
+    """Say in which zones the second copy is sharper or softer, each at the first aperture of its report."""
+    changes = []
+    for zone, where in zip(ZONES, ("in the centre", "halfway out", "in the corners"), strict=True):
+        share = second.tested[0].zones[zone] / first.tested[0].zones[zone] - 1.0
+        how = f"{abs(share):.0%} {'sharper' if share > 0 else 'softer'}"
+        changes.append(f"{'about the same' if abs(share) < 1.0 - _EVEN else how} {where}")
+    begin = f"Compared with this copy, the other one ({second.name}) is"
+    return f"{begin} {', '.join(changes[:-1])} and {changes[-1]}."
+
+
 # --- places of the field -------------------------------------------------------------------------
 
 

@@ -18,7 +18,7 @@ def labelled(count: int, half: str, seed: int) -> list[Labelled]:
     rows = []
     for i in range(count):
         features = rng.normal(size=FEATURES)
-        ncc = 1.0 - min(float(np.exp(-2.0 + features[0] + 0.1 * rng.normal())), 0.99)
+        ncc = 1.0 - min(float(np.exp(-2.0 - features[0] + 0.1 * rng.normal())), 0.99)
         about = {"group": f"{half}/{i // 8}", "half": half, "r_map_score": float(rng.random()), "ncc": ncc}
         rows.append(Labelled(features=tuple(features.tolist()), **about))
     return rows

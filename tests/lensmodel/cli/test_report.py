@@ -61,6 +61,7 @@ def test_the_report_speaks_of_sharpness_centring_aperture_and_the_next_photo(fol
     assert text.startswith("my-24mm: 3 photos, blur measured at 60 places; f/2\n")
     for words in ("MTF50", "centred", "sharpest over the whole picture at f/5.6", "would help most"):
         assert words in text
+    assert "about the same in the centre" in run("report", NAME, "--against", NAME, "--aperture", "2")
 
 
 def test_the_report_folder_holds_numbers_and_pictures_that_agree(folder: Path, few_places: None) -> None:
@@ -111,7 +112,12 @@ def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [("report", NAME, "-o", "mine.html"), ("report", "nobodys.lensprofile", "-o", "out"), ("target", ".")],
+    [
+        ("report", NAME, "-o", "mine.html"),
+        ("report", NAME, "-o", "out", "--against", "nobodys.lensprofile"),
+        ("report", "nobodys.lensprofile", "-o", "out"),
+        ("target", "."),
+    ],
 )
 def test_what_cannot_be_written_is_refused_before_anything_is(
     folder: Path, few_places: None, words: tuple[str, ...]

@@ -63,4 +63,4 @@ def test_features_hardly_change_when_the_plane_is_turned(
 def test_windows_score_above_the_same_in_heavy_noise(selector: Selector) -> None:
     quiet, loud = (looked_at(plane_of(3, sigma=sigma), sigma) for sigma in (SIGMA, 10 * SIGMA))
 
-    assert selector.score(*quiet).mean() > selector.score(*loud).mean() + 0.05
+    assert selector.score(*quiet).mean() > selector.score(*loud).mean() + 0.1

@@ -1,4 +1,4 @@
-"""The report: its figures against true kernels, its verdict, and its files."""
+"""The report: its figures against true kernels, its verdict, its files, and two copies compared."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lensmodel.core.psf import PsfSample, delta
 from lensmodel.core.types import CHANNELS, FieldPosition, Frame, LensSettings
 from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.quality import mtf50_from_kernel
-from lensmodel.report import LensReport, filled_aspect, lens_report, place_table, sharpness, to_csv
+from lensmodel.report import LensReport, compare, filled_aspect, lens_report, place_table, sharpness, to_csv
 from lensmodel.report.centring import Asymmetry, Centring, direction_in_words
 from lensmodel.report.lens_report import UNKNOWN, SensorGeometry, half_sides, marked_places
 from lensmodel.report.plots import charts, pages, to_pdf, to_png
@@ -260,6 +260,16 @@ def test_pages_are_written_in_each_format_and_the_same_each_time(soft: LensRepor
     assert first == second  # no time of day in it
     with Image.open(io.BytesIO(to_png(pages(soft)[0]))) as picture:
         assert picture.size[0] > 1000
+
+
+def test_two_copies_are_compared(soft: LensReport) -> None:
+    sharp = replace(report_of(corner=1.0, spread=0.02), name="Another lens")
+
+    share = sharp.tested[0].zones["corner"] / soft.tested[0].zones["corner"] - 1.0
+    assert share > 0.3
+    assert compare(soft, sharp).startswith("Compared with this copy, the other one (Another lens) is ")
+    assert compare(soft, sharp).endswith(f"{share:.0%} sharper in the corners.")
+    assert "about the same in the centre" in compare(soft, soft)
 
 
 def test_apertures_are_tested_each_and_the_best_is_named() -> None:

@@ -85,7 +85,7 @@ lens.save("test.lensprofile")
 planes = np.random.default_rng(0).random((3, 64, 96), dtype=np.float32)
 assert lensmodel.correct(planes, "test.lensprofile", aperture=2.0, method="fast").planes.shape == planes.shape
 PYTHON
-lensmodel export test.lensprofile --r 0.5 --output psf.npz
+lensmodel export test.lensprofile --rows 1 --cols 1 --output psf.npz
 test -s psf.npz
 lensmodel report test.lensprofile --output report
 test -s report/report.pdf

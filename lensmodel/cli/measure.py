@@ -66,6 +66,8 @@ def measure(
         config = configured(store.model, LensSettings(aperture=aperture))
         calibration = Calibration(store, config, any_lens=any_lens)
     method, results = measuring.methods.create(kind), list[dict[str, Any]]()
+    if len(paths) % method.photos:
+        raise UsageError(f"measuring by {kind} takes {method.photos} photos at a time, got {len(paths)}")
     groups = [paths[at : at + method.photos] for at in range(0, len(paths), method.photos)]
     with shown.progress(total=len(groups)) as bar:
         for number, group in enumerate(groups):

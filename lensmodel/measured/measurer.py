@@ -15,10 +15,11 @@ of
 
     sum_p (y - k * x - c)² / (q s²) + sum_t k(t)² / t(d)²
 
-over all k >= 0 whose sum is that of the minimum over all k, where q >= 1 is the mean of the squared residuals
-over what the noise explains. Without the sum, k >= 0 alone would cut off one half of the noise and keep the
-other: hundreds of values around a small core then add up to a halo that is not there. Its
-expected error is  e² = trace (X'X / q + diag(1 / t²))^-1 / |k|².
+over all k >= 0 whose sum is that of the minimum over all k, where q is the mean of the squared residuals over
+what the noise explains, below 1 only where that is overstated, as it is of a scene without a flat place.
+Without the sum, k >= 0 alone would cut off one half of the noise and keep the other: hundreds of values
+around a small core then add up to a halo that is not there. Its expected error is
+e² = trace (X'X / q + diag(1 / t²))^-1 / |k|².
 
 A kernel that changes within the window (`varying`) is linear in the place, k + u k_u + v k_v with u and v
 from -1 to 1 over its rows and columns; k_u and k_v are eliminated too. It is found at the phase between
@@ -203,7 +204,9 @@ def solve(
     for _ in range(2):  # the second time with the residuals of the first
         k = _bounded(gram[:n, :n] + np.diag(prior), gram[:n, n], k)
         rest = np.append(-k, 1.0)
-        misfit = max(misfit * float(rest @ gram @ rest) / count, 1.0)
+        left = misfit * float(rest @ gram @ rest)
+        # below 1 only where all n values of a kernel cannot have taken off so much: the noise was overstated
+        misfit = max(left / count, min(left / max(count - n, 1), 1.0))
         gram = _of_kernel(whole, misfit, prior)
     if varying:
         k, moved = _on_its_grid(gram, prior, k, size)

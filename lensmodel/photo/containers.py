@@ -326,6 +326,7 @@ _FILTERS: Final = "RGBCMYW"  # CFAPattern: TIFF/EP, section 5.2.1
 # PhotometricInterpretation: colour filter array (TIFF/EP), linear RAW (DNG 1.6, chapter 3); grey is 1, RGB 2
 _RAW_PHOTOMETRIC: Final = {32803, 34892}
 _DEPTHS: Final = {1: {8, 16}, 3: {16, 32, 64}, 4: {8, 16}}  # bits by SampleFormat: integer, floating, unsaid
+_OTHER_COLOURS: Final = {0: "inverted grey", 3: "a palette", 5: "CMYK", 6: "YCbCr", 8: "CIE Lab"}
 
 
 def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Header:
@@ -407,10 +408,12 @@ def _check_numbers(tags: Tags) -> None:
     """Refuse numbers that are not read, or stand for other things than light, before they are stored."""
     kind, samples, bits = tags.integer(262, 1), tags.integer(277, 1), tags.integer(258, 1)
     read = kind in {1, 2} and (1, 3)[kind == 2] <= samples <= 4
-    if not read or bits not in _DEPTHS.get(tags.integer(339, 1), ()):
+    form = tags.integer(339, 1)
+    if not read or bits not in _DEPTHS.get(form, ()):
+        colours = _OTHER_COLOURS.get(kind, f"PhotometricInterpretation {kind}")
         raise UnsupportedFormatError(
-            f"the TIFF holds no RGB or grey of 8 or 16 bits, or of floating-point numbers, but {samples} "
-            f"samples of {bits} bits, PhotometricInterpretation {kind}; convert it"
+            f"the TIFF holds no RGB or grey of unsigned 8 or 16 bits, or of floating-point numbers, but "
+            f"{samples} samples of {bits} bits, SampleFormat {form}, {colours}; convert it"
         )
 
 

@@ -541,4 +541,6 @@ def _three_channels(pixels: Pixels) -> Pixels:
         pixels = np.nan_to_num(pixels, posinf=max(1.0, float(known.max(initial=0.0))), neginf=0.0)
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
+    if pixels.ndim != 3 or pixels.shape[2] > 4:
+        raise UnsupportedFormatError(f"a picture of shape {pixels.shape} is no photo; give RGB on one page")
     return np.repeat(pixels[:, :, :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[:, :, :3]

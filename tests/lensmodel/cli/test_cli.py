@@ -309,7 +309,7 @@ def test_a_photo_of_another_lens_is_corrected_on_demand_and_said_to_be_one(
 
 CORRECT, CALIBRATE = ("correct", "one.dng", "-o", "o"), ("calibrate", "one.dng")
 REFUSED = {
-    "half a pair": (("measure", "pair", "one.dng", "-p", "new"), 1, "takes 2 photos at a time, got 1"),
+    "half a pair": (("measure", "pair", "one.dng", "-p", "new"), 2, "takes 2 photos at a time, got 1"),
     "missing photo": (("calibrate", "gone.dng", "-p", "new"), 2, "no photo called gone.dng"),
     "empty folder": (("calibrate", "empty", "-p", "new"), 2, "no photo in the folder empty"),
     "no image": (("correct", "text.dng", "-p", PROFILE), 1, "belong to no photo format"),

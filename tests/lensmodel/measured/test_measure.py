@@ -326,6 +326,15 @@ def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
     assert steps.count((0, 1)) > 50  # aligning them shows, too
 
 
+def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
+    # the left of the frame is quiet
+    contrast = np.clip(np.linspace(-0.06, 0.3, PAIR_SHAPE[1] + 2 * targets.MARGIN), 0.0, 0.12)
+    said = (NoiseModel(100 * NOISE.shot, 100 * NOISE.read),) * 3  # as where no place of a photo is flat
+    pair = [replace(photo, noise=said, sensor_noise=said) for photo in pair_of(contrast, moved=False)]
+
+    assert error_of_pair(pair, 104) < 0.1
+
+
 @pytest.mark.parametrize(
     ("method", "photos", "size", "said"),
     [

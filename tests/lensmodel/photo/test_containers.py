@@ -104,16 +104,16 @@ def test_what_the_photos_own_directory_says_goes_before_the_previews(tmp_path: P
 @pytest.mark.parametrize(
     ("pixels", "options", "word"),
     [
-        (np.zeros((48, 64, 4), np.uint8), {"photometric": "separated"}, "Interpretation 5"),
-        (np.zeros((48, 64, 3), np.uint8), {"photometric": "cielab"}, "Interpretation 8"),
-        (np.zeros((48, 64, 3), np.uint8), {"photometric": "ycbcr"}, "Interpretation 6"),
-        (np.zeros((48, 64, 3), np.uint8), {"photometric": "rgb", "compression": "jpeg"}, "Interpretation 6"),
+        (np.zeros((48, 64, 4), np.uint8), {"photometric": "separated"}, "CMYK"),
+        (np.zeros((48, 64, 3), np.uint8), {"photometric": "cielab"}, "Lab"),
+        (np.zeros((48, 64, 3), np.uint8), {"photometric": "ycbcr"}, "YCbCr"),
+        (np.zeros((48, 64, 3), np.uint8), {"photometric": "rgb", "compression": "jpeg"}, "YCbCr"),
         (np.zeros((48, 64, 6), np.uint8), {"photometric": "rgb", "planarconfig": "contig"}, "6 samples"),
-        (np.zeros((48, 64), np.int16), {"photometric": "minisblack"}, "convert it"),
-        (np.zeros((48, 64), np.complex64), {"photometric": "minisblack"}, "convert it"),
+        (np.zeros((48, 64), np.int16), {"photometric": "minisblack"}, "unsigned .* SampleFormat 2"),
+        (np.zeros((48, 64), np.complex64), {"photometric": "minisblack"}, "SampleFormat 6"),
         (np.zeros((48, 64), bool), {"photometric": "minisblack"}, "1 bits"),
-        (np.zeros((48, 64), np.uint8), {"photometric": "miniswhite"}, "Interpretation 0"),
-        (np.zeros((48, 64), np.uint8), {"photometric": "palette", "colormap": COLOURS}, "Interpretation 3"),
+        (np.zeros((48, 64), np.uint8), {"photometric": "miniswhite"}, "inverted"),
+        (np.zeros((48, 64), np.uint8), {"photometric": "palette", "colormap": COLOURS}, "palette"),
         (np.zeros((48, 64), np.uint8), {"bigtiff": True}, "BigTIFF"),
     ],
 )
@@ -124,6 +124,13 @@ def test_a_tiff_that_could_only_fail_is_refused_before_it_is_stored(
 
     with pytest.raises(UnsupportedFormatError, match=word):
         photo.inspect(tmp_path / "x.tif")
+
+
+def test_a_tiff_of_a_volume_is_refused(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "x.tif", np.zeros((48, 48, 48), np.uint8), volumetric=True)
+
+    with pytest.raises(UnsupportedFormatError, match="one page"):
+        photo.develop(tmp_path / "x.tif")
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ from lensmodel.photo.values import (
     Transfer,
     remarks_log,
 )
-from lensmodel.photo.writing import OPCODES_2, OPCODES_3
+from lensmodel.photo.writing import OPCODES_2, OPCODES_3, opcodes_of_planes
 
 MIN_SIDE = 16  # smaller pictures are icons, not photos
 
@@ -303,9 +303,9 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
     if mosaic is not None:
         white, clip = mosaic.saturation()
         sensor_noise, cfa, stated = mosaic.noise(white), mosaic.bayer_pattern(), ()
-        if opcodes:
-            opcodes = b""
-            remarks.append("what its OpcodeList2 asks of the mosaic, such as brighter corners, is dropped")
+        opcodes, lost = opcodes_of_planes(opcodes, cfa)
+        if lost:
+            remarks.append(f"what its OpcodeList2 asks of the mosaic alone is dropped ({lost})")
         if count := mosaic.repair():
             many = " of its sensor is" if count == 1 else "s of its sensor are"
             remarks.append(f"{count} defective pixel{many} replaced")

@@ -1,6 +1,6 @@
 """Linear planes to files: complete or not at all, with profile and the safe part of EXIF; DNG.
 
-Source: Adobe, "Digital Negative (DNG) Specification" 1.4, 2012, and 1.6, 2021.
+Source: Adobe, "Digital Negative (DNG) Specification" 1.4, 2012, and 1.6, 2021 (chapter 7: opcodes).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from PIL import Image
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 from lensmodel.core.names import full_name
-from lensmodel.core.types import Planes
+from lensmodel.core.types import BayerPattern, Planes
 from lensmodel.photo.colour import (
     D65_TO_D50,
     SRGB_TO_XYZ_D65,
@@ -303,3 +303,40 @@ def dng_tags(
         50735: (ASCII, metadata.body_serial),  # CameraSerialNumber
         50778: (SHORT, 21),  # CalibrationIlluminant1: D65, in the numbers of Exif's LightSource
     }
+
+
+_GAIN_MAP: Final = 9  # number of an opcode
+_GAIN_HEAD: Final = struct.Struct(">10I4dI")
+_MOST: Final = 64  # opcodes of a list (chosen): cameras write below ten
+
+
+def opcodes_of_planes(block: bytes, cfa: BayerPattern | None) -> tuple[bytes, int]:
+    """Rewrite an OpcodeList2, which is for a mosaic, for planes, and say how many opcodes are lost.
+
+    A gain map of every second pixel is that of a colour; each of the two of green gives its square root.
+    Others mean nothing without the mosaic; a list that is damaged gives what came before the damage.
+    """
+    kept, lost, at = list[bytes](), 0, 4
+    for _ in range(min(int.from_bytes(block[:4], "big"), _MOST)):
+        number, version, flags, size = struct.unpack(">4I", block[at : at + 16].ljust(16, b"\xff"))
+        data, at = block[at + 16 : at + 16 + size], at + 16 + size
+        if at > len(block):
+            break
+        known = number == _GAIN_MAP and size >= _GAIN_HEAD.size
+        head = _GAIN_HEAD.unpack_from(data) if known else (0,) * 15
+        (top, left, bottom, right), pitch, gains = head[:4], head[6:8], data[_GAIN_HEAD.size :]
+        if pitch == (2, 2) and cfa is not None:
+            colour = cfa[top % 2][left % 2]
+            if colour == 1:
+                whole = np.frombuffer(gains[: len(gains) // 4 * 4], ">f4")
+                gains = np.sqrt(np.maximum(whole, 0.0)).astype(">f4").tobytes()
+            # the two rows and columns between whose pixels the others stood
+            area = (top - top % 2, left - left % 2, bottom + bottom % 2, right + right % 2, colour, 1)
+        elif pitch == (1, 1):
+            area = (top, left, bottom, right, 0, 3)
+        else:
+            lost += 1
+            continue
+        body = _GAIN_HEAD.pack(*area, 1, 1, *head[8:]) + gains
+        kept.append(struct.pack(">4I", number, version, flags, len(body)) + body)
+    return struct.pack(">I", len(kept)) + b"".join(kept) if kept else b"", lost

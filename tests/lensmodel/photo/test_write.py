@@ -31,7 +31,7 @@ from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, matrix3, srgb_to_linear
 from lensmodel.photo.metadata import gps_directory, xmp_packet
-from lensmodel.photo.writing import XYZ_TO_SRGB, write_bayer_dng
+from lensmodel.photo.writing import XYZ_TO_SRGB, opcodes_of_planes, write_bayer_dng
 
 METADATA = photo.PhotoMetadata(
     camera_maker="Canon",
@@ -489,26 +489,65 @@ def opcode_lists(path: Path) -> list[bytes]:
         return [bytes(tags[tag].value) if tag in tags else b"" for tag in (51009, 51022)]
 
 
-def test_a_warp_goes_into_the_corrected_dng_and_what_is_for_the_mosaic_is_said_to_be_dropped(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    source, written = (
-        REPORTS / "gainmap-warp.dng",
-        corrected(REPORTS / "gainmap-warp.dng", tmp_path / "x.dng", "dng"),
-    )
+def test_gain_map_and_warp_go_into_the_corrected_dng(tmp_path: Path) -> None:
+    source = opcode_lists(REPORTS / "gainmap-warp.dng")
+    gain, warp = opcode_lists(corrected(REPORTS / "gainmap-warp.dng", tmp_path / "x.dng", "dng"))
 
-    assert "its OpcodeList2 asks of the mosaic" in caplog.text
-    assert opcode_lists(written) == [b"", opcode_lists(source)[1]]
+    assert warp == source[1]
+    assert struct.unpack(">8I", gain[20:52]) == (0, 0, 224, 360, 0, 3, 1, 1)  # of all three planes
+    assert gain[52:] == source[0][52:]
     # those of a linear DNG are for its planes
-    data = written.read_bytes()
-    written.write_bytes(data.replace(struct.pack("<H", 51022), struct.pack("<H", 51009)))
-    assert opcode_lists(corrected(written, tmp_path / "y.dng", "dng")) == opcode_lists(written)
+    assert opcode_lists(corrected(tmp_path / "x.dng", tmp_path / "y.dng", "dng")) == [gain, warp]
 
 
 def test_a_file_that_cannot_keep_them_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     corrected(REPORTS / "gainmap-warp.dng", tmp_path / "x.tif", "tiff16")
 
     assert "only DNG output keeps that" in caplog.text
+
+
+def opcode(number: int, data: bytes) -> bytes:
+    return struct.pack(">4I", number, 0x01030000, 1, len(data)) + data
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+def test_gain_maps_of_the_four_sites_of_a_mosaic_become_those_of_three_colours(
+    pattern: str, tmp_path: Path
+) -> None:
+    sites = [(row, col, [1.0 + row, 2.0, 3.0, 4.0 + col]) for row in (0, 1) for col in (0, 1)]
+    maps = [
+        struct.pack(">10I4dI4f", row, col, 48, 64, 0, 1, 2, 2, 2, 2, 1.0, 1.0, 0.0, 0.0, 1, *gains)
+        for row, col, gains in sites
+    ]
+    block = struct.pack(">I", 5) + b"".join([*(opcode(9, each) for each in maps), opcode(4, b"\0" * 8)])
+    path = tmp_path / "x.dng"
+    mosaic = np.random.default_rng(0).integers(2000, 2900, (48, 64), dtype=np.uint16)
+    write_bayer_dng(path, mosaic, black=512, white=15000, pattern=pattern)
+    data = bytearray(path.read_bytes())
+    at = next(i for i in range(10, 600, 12) if data[i : i + 2] == struct.pack("<H", 50708))
+    data[at : at + 12] = struct.pack("<HHII", 51009, 7, len(block), len(data))  # in the place of its camera
+    path.write_bytes(bytes(data) + block)
+
+    kept, _ = opcode_lists(corrected(path, tmp_path / "out.dng", "dng"))
+
+    gains = np.ones((3, 4))  # of a plane: greens of both sites, one after the other, are their geometric mean
+    for step in np.split(np.frombuffer(kept[4:], np.uint8), 4):
+        area = struct.unpack(">8I", step.tobytes()[16:48])
+        assert area[5:] == (1, 1, 1)
+        gains[area[4]] *= np.frombuffer(step.tobytes()[-16:], ">f4")
+    seen, of_green = np.array([each for *_, each in sites]), np.array([letter == "G" for letter in pattern])
+    assert gains[1] == pytest.approx(np.sqrt(seen[of_green].prod(axis=0)), rel=1e-6)
+    assert gains[0] == pytest.approx(seen[pattern.index("R")])
+    assert photo.develop(path).remarks[0] == "what its OpcodeList2 asks of the mosaic alone is dropped (1)"
+
+
+@pytest.mark.parametrize("cut", [0, 3, 4, 19, 30, 410])
+def test_a_damaged_list_gives_what_came_before_the_damage(cut: int) -> None:
+    block = opcode_lists(REPORTS / "gainmap-warp.dng")[0]
+
+    assert opcodes_of_planes(block[:cut], None) == (b"", 0)
+    assert opcodes_of_planes(struct.pack(">I", 2**32 - 1) + block[4:], None) == opcodes_of_planes(block, None)
+    assert opcodes_of_planes(struct.pack(">I", 1) + opcode(9, block[20:60]), None) == (b"", 1)
 
 
 @pytest.mark.parametrize("output", [*FORMATS, "tiff32"])

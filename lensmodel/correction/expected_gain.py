@@ -166,7 +166,7 @@ WORTH_DB: Final = 0.1  # expected gain below which a place is left as it is: not
 _SHARES: Final = np.array([1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1, 0.0], dtype=np.float32)
 """Shares of a kernel to try, the last if all others may harm; finer steps change the error by a hundredth."""
 
-_SHARPER: Final = 3.5  # sigmas of width tried out of focus (chosen: with 2, three times as many blocks lose)
+_SHARPER: Final = 3.0  # sigmas of width tried out of focus (chosen: with 2, twice as many such blocks lose)
 
 _EVERY: Final = 3  # of the rows and columns suffices for a mean; odd, to meet all colours of a mosaic
 _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
@@ -242,11 +242,11 @@ def plan(
 
     Detail in focus gains at many frequencies, at which a kernel errs this way and that. What is out of focus
     gains at a few low ones, and is lost there altogether if the kernel is too wide. There no share is taken
-    that would do harm if the true kernel were narrower by z standard deviations of its width, short of a
+    that would do harm if the true kernel were narrower by z standard deviations w of its width, short of a
     point, less noise counting as no gain; if all would, s is 0. Nothing fine is there but grain, so t fills
     up what W leaves of it::
 
-        H = K |K|^-min( z D^(1/2) / |K ln |K||, 1 ),    t ( 1 - min( |W|², 1 ) )
+        H = K |K|^-min( z w, 1 ),    t ( 1 - min( |W|², 1 ) )
 
     `offsets` are the lateral shifts of the channels, `(row, col)` in pixels; `returned` is t.
     """
@@ -259,16 +259,16 @@ def plan(
         noise = float(sensor.variance(tile[c, ::_EVERY, ::_EVERY].mean()))
         seen = noise_power(noise, c, mosaic=sensor.measured is not None)
         law = scene_law(rings[c], K.real**2 + K.imag**2 + posterior.variance, seen)
-        scenes.append((K, point, posterior.variance, noise, *law))
+        scenes.append((K, point, posterior, noise, *law))
     soft = softness(float(np.median([slope for *_, slope in scenes])))
-    z = _SHARPER * soft
     before = after = 0.0
     shares: list[float] = []
-    for K, point, D, noise, level, slope in scenes:
+    for K, point, posterior, noise, level, slope in scenes:
         left, harm = np.empty((2, _SHARES.size))
-        spectra = (K, point, scene_power(level, slope), D, frequency_counts(GRID))
-        t, n = np.float32(returned), np.float32(noise)
-        before += _remaining(*spectra, n, _SHARES, t, np.float32(soft), np.float32(z), left, harm)
+        spectra = (K, point, scene_power(level, slope), posterior.variance, frequency_counts(GRID))
+        narrower = min(_SHARPER * soft * posterior.width_error, 1.0)
+        n, t, s_, less = (np.float32(value) for value in (noise, returned, soft, narrower))
+        before += _remaining(*spectra, n, _SHARES, t, s_, less, left, harm)
         harmless = harm <= 0.0
         harmless[-1] = not harmless[:-1].any()  # by a point only noise is taken
         best = int(np.argmin(np.where(harmless, left, np.inf)))
@@ -290,13 +290,13 @@ def _remaining(
     shares: Real,
     returned: Number,
     soft: Number,
-    z: Number,
+    narrower: Number,
     out: NDArray[np.float64],
     harm: NDArray[np.float64],
 ) -> float:
     """Expected squared error that each share of a kernel leaves, and, returned, of the photo; see `plan`.
 
-    `harm` receives by how much the error rises if the kernel is narrower by z standard deviations.
+    `harm` receives by how much the error rises, in a soft scene, if the kernel is `narrower` by this share.
     """
     one, least, before = np.float32(1.0), np.float32(_LEAST), np.float64(0.0)
     sharper = np.ones_like(D)  # |H| / |K|
@@ -305,10 +305,9 @@ def _remaining(
         for j in range(K.shape[1]):
             a, b = one - K[i, j].real, K[i, j].imag
             part += times[i, j] * (S[i, j] * (a * a + b * b + D[i, j]) + noise)
-            if z > np.float32(0.0):
-                size = max(np.abs(K[i, j]), np.float32(1e-6))
-                width = -np.log(min(size, np.float32(0.9999)))
-                sharper[i, j] = np.exp(width * min(z * np.sqrt(D[i, j]) / (size * width), one))
+            if soft > np.float32(0.0):
+                size = min(max(np.abs(K[i, j]), np.float32(1e-6)), one)
+                sharper[i, j] = np.exp(-narrower * np.log(size))
         before += part
     for number in range(shares.size):
         share, total, rise = shares[number], np.float64(0.0), np.float64(0.0)
@@ -333,7 +332,7 @@ def _remaining(
             total += part
             rise += more
         out[number] = total
-        harm[number] = rise if z > np.float32(0.0) else np.float64(0.0)
+        harm[number] = rise if soft > np.float32(0.0) else np.float64(0.0)
     return before
 
 

@@ -36,22 +36,23 @@ class PsfPosterior:
     kernel: Kernel  # (k, k), the mean
     variance: NDArray[np.float32]  # (64, 33), expected |H - E[H]|² at the `rfft2` frequencies of `GRID`
     error: float  # expected relative L2 distance of the true kernel from the mean
+    width_error: float  # the same of ln |H|, which goes with the squared width
 
     @classmethod
     def of_error(cls, kernel: Kernel, error: float, rings: NDArray[np.float64] | None = None) -> PsfPosterior:
         """A kernel of which the relative L2 error e is known: most likely its width is wrong.
 
-        Var[H] = e² |H|² ln²|H| sum |H|² / sum |H|² ln²|H|, as an error of the width makes. It is no more than
-        the square of the error that is expected at a frequency, where its r.m.s. in eight `rings` up to .5
-        cycles/pixel is known; below the middle of the first it falls as |f|².
+        Var[H] = w² |H|² ln²|H|,  w² = e² sum |H|² / sum |H|² ln²|H|, as an error w of ln |H| makes. It is no
+        more than the square of the error that is expected at a frequency, where its r.m.s. in eight `rings`
+        up to .5 cycles/pixel is known; below the middle of the first it falls as |f|².
         """
         if not (math.isfinite(error) and error >= 0.0):
             raise InvalidInputError(f"psf_error must be finite and not negative, got {error}")
         if error == 0.0 or kernel.shape[0] > WIDEST:
-            return cls(kernel, np.zeros((GRID[0], GRID[1] // 2 + 1), dtype=np.float32), error)
+            return cls(kernel, np.zeros((GRID[0], GRID[1] // 2 + 1), dtype=np.float32), error, 0.0)
         H = otf(kernel, GRID)
         power = np.maximum(H.real**2 + H.imag**2, _LEAST)
-        shape = power * np.log(power) ** 2
+        shape = power * (0.5 * np.log(power)) ** 2
         times = np.full(power.shape, 2.0)  # how often each column of the half spectrum stands in the whole
         times[:, [0, -1]] = 1.0
         scale = error**2 * float((times * power).sum()) / max(float((times * shape).sum()), _LEAST)
@@ -61,7 +62,7 @@ class PsfPosterior:
             middles = (np.arange(len(rings)) + 0.5) / (2 * len(rings))
             known = np.interp(f, middles, rings) * np.minimum(f / middles[0], 1.0) ** 2
             variance = np.minimum(variance, known**2)
-        return cls(kernel, variance.astype(np.float32), error)
+        return cls(kernel, variance.astype(np.float32), error, math.sqrt(scale))
 
 
 @runtime_checkable

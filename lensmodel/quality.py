@@ -369,7 +369,7 @@ def _segments(means: NDArray[np.float32]) -> list[NDArray[np.float64]]:
     down[1:-1] = (means[2:] - means[:-2]) / 2
     weight = across * across + down * down
     x, y = np.arange(means.shape[1]), np.arange(means.shape[0])[:, None]
-    energy = _sums(weight)
+    energy = np.maximum(_sums(weight), np.finfo(np.float64).tiny)
     xx, xy, mean_x, mean_y, var_x, cov, var_y = (
         _sums(product) / energy
         for product in (

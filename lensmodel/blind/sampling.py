@@ -156,6 +156,7 @@ def find_patches(
         count=count,
         size=size,
         selector=selector,
+        jpeg=developed.lossy,
         coarse_noise=developed.coarse_noise[1],
         on_step=on_step,
     )

@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
@@ -299,6 +300,8 @@ def _why_left(corrected: lensmodel.Corrected, *, lossy: bool) -> str:
 
 # --- photos sorted by their lens ---------------------------------------------------------------
 
+# Photos at the same settings that follow each other within this time show the same (chosen)
+BURST: Final = timedelta(seconds=2)
 # Characters of a file name (chosen): file systems take 255 bytes, and the ending needs some
 MOST_IN_NAME: Final = 80
 
@@ -356,20 +359,36 @@ class PhotoGroup:
             "focal_length": f"{'-'.join(ends)} mm" if known else "unknown focal length",
         }
 
+    @property
+    def scenes(self) -> int:
+        """How many different things the photos show: the frames of a burst are one."""
+        return len(self.shots) - len(self._repeated())
+
     def to_learn_from(self) -> list[Path]:
         """Return the photos in the order in which they tell most: each aperture's first one, then the second.
 
-        Of one aperture first those far apart in the folder, since neighbours show the same.
+        A photo whose aperture is unknown is the last of its turn; later frames of a burst come after all.
         """
-        # by the binary digits of their number, backwards: the first, the middle, the quarters, ...
-        apart = sorted(enumerate(self.shots), key=lambda at: f"{at[0]:032b}"[::-1])
-        turns, order = Counter[float](), []
+        repeated, turns = self._repeated(), Counter[tuple[bool, float]]()
+        order = []
         # a smaller frame is the middle of what the lens draws: the largest ones tell of all of it
-        for _, shot in sorted(apart, key=lambda at: -round(at[1].half_diagonal_mm)):
-            aperture = shot.metadata.aperture or math.inf  # unknown, the last of its turn
-            order.append((turns[aperture], aperture, shot.path))
-            turns[aperture] += 1
+        for shot in sorted(self.shots, key=lambda shot: -round(shot.half_diagonal_mm)):
+            again, aperture = shot.path in repeated, shot.metadata.aperture or math.inf
+            order.append((again, turns[again, aperture], aperture, shot.path))
+            turns[again, aperture] += 1
         return [path for *_, path in sorted(order)]
+
+    def _repeated(self) -> set[Path]:
+        """Later frames of a burst: those that soon follow one at the same settings."""
+        repeated: set[Path] = set()
+        last: dict[tuple[float | None, float], datetime] = {}
+        timed = [(shot.metadata.taken_at, shot.path, shot) for shot in self.shots if shot.metadata.taken_at]
+        for time, path, shot in sorted(timed, key=lambda each: each[:2]):
+            settings = shot.metadata.aperture, shot.focal_mm
+            if settings in last and time - last[settings] <= BURST:
+                repeated.add(path)
+            last[settings] = time
+        return repeated
 
 
 def groups(shots: Iterable[Shot]) -> list[PhotoGroup]:
@@ -452,7 +471,7 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
 
 def _learn(group: PhotoGroup, profile: Path, most: int, correction: Correction) -> int:
     """Learn the lens of a group; return from how many photos, now or in an earlier run."""
-    display, counted, most = correction.display, 0, min(most, len(group.shots))
+    display, counted, most = correction.display, 0, min(most, group.scenes)
     store = files.ProfileFile(profile)
     config = configured(store.model, LensSettings(aperture=correction.options["aperture"]))
     calibration = Calibration(store, config, any_lens=correction.any_lens)

@@ -242,7 +242,7 @@ def plan(
 
     Detail in focus gains at many frequencies, at which a kernel errs this way and that. What is out of focus
     gains at a few low ones, and is lost there altogether if the kernel is too wide. There no share is taken
-    that would do harm if the true kernel were narrower by z standard deviations w of its width, short of a
+    that would do harm if the true kernel were narrower by z standard deviations w of ln |K|, short of a
     point, less noise counting as no gain; if all would, s is 0. Nothing fine is there but grain, so t fills
     up what W leaves of it::
 
@@ -267,8 +267,10 @@ def plan(
         left, harm = np.empty((2, _SHARES.size))
         spectra = (K, point, scene_power(level, slope), posterior.variance, frequency_counts(GRID))
         narrower = min(_SHARPER * soft * posterior.width_error, 1.0)
-        n, t, s_, less = (np.float32(value) for value in (noise, returned, soft, narrower))
-        before += _remaining(*spectra, n, _SHARES, t, s_, less, left, harm)
+        before += _remaining(
+            *(*spectra, np.float32(noise), _SHARES, np.float32(returned), np.float32(soft)),
+            *(np.float32(narrower), left, harm),
+        )
         harmless = harm <= 0.0
         harmless[-1] = not harmless[:-1].any()  # by a point only noise is taken
         best = int(np.argmin(np.where(harmless, left, np.inf)))

@@ -36,7 +36,7 @@ class PsfPosterior:
     kernel: Kernel  # (k, k), the mean
     variance: NDArray[np.float32]  # (64, 33), expected |H - E[H]|² at the `rfft2` frequencies of `GRID`
     error: float  # expected relative L2 distance of the true kernel from the mean
-    width_error: float  # the same of ln |H|, which goes with the squared width
+    width_error: float  # w, expected relative error of ln |H|, which grows as the squared width
 
     @classmethod
     def of_error(cls, kernel: Kernel, error: float, rings: NDArray[np.float64] | None = None) -> PsfPosterior:

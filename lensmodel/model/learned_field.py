@@ -21,7 +21,7 @@ from lensmodel.core.psf import KINDS, EncodedPatch, PatchKind, PsfSample, centre
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, query
 from lensmodel.model.query import Part
-from lensmodel.neural import FieldAnswer, FieldNetwork, Memory, conditions_of
+from lensmodel.neural import RING_MIDDLES, FieldAnswer, FieldNetwork, Memory, conditions_of
 
 NEAREST: Final = 256  # samples that a question attends to (chosen: the patches of three photos)
 
@@ -31,7 +31,6 @@ _CELL: Final = np.array([0.25, 0.25, 1.0 / 3.0, 0.25, 0.5]) / query.UNITS
 _MEMORIES: Final = 64  # neighbourhoods whose keys are kept (chosen: a whole picture's, a megabyte each)
 _ANSWERS: Final = 64  # that are kept: of all channels, which are asked for one after the other (chosen)
 _ROW_BYTES: Final = 200  # of a patch besides its token: place, settings, its part of the tree
-_RINGS: Final = (np.arange(8) + 0.5) / 16.0  # cycles/pixel, of the errors that the network tells
 _KEY_BYTES: Final = 4608  # of a patch: keys and values of three attentions, 192 floats each
 
 
@@ -81,7 +80,7 @@ class LearnedField:
             np.asarray(answer.weights, dtype=np.float64),
             self._photos[rows],
             query.nearest(self._where[rows], query.in_units(position, settings)),
-            np.interp(scale * _RINGS, _RINGS, answer.ring_error[channel]),
+            np.interp(scale * RING_MIDDLES, RING_MIDDLES, answer.ring_error[channel]),
         )
 
     def _answer_of(

@@ -4,6 +4,6 @@ Both are the same in all eight octants of the field. `lensmodel.blind.learned` t
 from photos, and `lensmodel.model.learned_field` asks of those of all photos; `lab.population` trains it.
 """
 
-from lensmodel.neural.network import FieldAnswer, FieldNetwork, Memory, conditions_of
+from lensmodel.neural.network import RING_MIDDLES, FieldAnswer, FieldNetwork, Memory, conditions_of
 
-__all__ = ["FieldAnswer", "FieldNetwork", "Memory", "conditions_of"]
+__all__ = ["RING_MIDDLES", "FieldAnswer", "FieldNetwork", "Memory", "conditions_of"]

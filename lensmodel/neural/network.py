@@ -132,6 +132,7 @@ COARSE: Final = 25
 BLOCK: Final = 3
 SIDE: Final = COARSE * BLOCK  # of a kernel, told in cells of BLOCK x BLOCK pixels beyond the fine part
 RINGS: Final = 8  # of frequency, 1/16 cycles/pixel wide, for which an error of the transfer function is told
+RING_MIDDLES: Final = (np.arange(RINGS) + 0.5) / (2 * RINGS)  # cycles/pixel
 
 WEIGHTS: Final = Path(__file__).parent / "data" / "weights.npz"  # the weights of the package
 _CLAMP: Final = 6.0  # standard deviations that a statistic may lie off the population's mean
@@ -246,6 +247,8 @@ class FieldNetwork:
             raise InvalidInputError(
                 f"statistics must be (n, {LENGTH}) and places (n, 2), got {statistics.shape} and {xy.shape}"
             )
+        if not (np.isfinite(statistics).all() and np.isfinite(xy).all()):
+            raise InvalidInputError("statistics and places must be finite; leave patches out that are not")
         rows = np.broadcast_to(conditions, (len(xy), SETTINGS))
         x = np.clip((statistics - self.weights["mean"]) / self.weights["spread"], -_CLAMP, _CLAMP)
         x = np.concatenate([x, condition_features(rows), place_features(xy)], -1)

@@ -41,6 +41,7 @@ FLAT_CONTRAST: Final = 4.0  # variance of signal over noise: below, noise decide
 FLAT_EIGENVALUE: Final = 10.0  # smaller eigenvalue of the structure tensor over that of noise (chosen)
 ONE_DIRECTION_RATIO: Final = 0.05  # the same over the larger one: a line has next to nothing (chosen)
 SECTOR_INFORMATION: Final = float(np.log(2.0))  # power twice that of noise, signal as strong as noise
+JPEG_WEIGHT: Final = 0.3  # JPEG files were sharpened and gamma-coded: their patches count for less
 EVIDENCE_FLOOR: Final = 0.25  # bits a frequency: signal as strong as noise over a quarter of them
 SHORTLIST_A_SECTOR: Final = 8  # windows that the costlier scores look at: several times those taken (chosen)
 
@@ -109,6 +110,7 @@ def select(
     count: int = 48,
     size: int = 192,
     selector: str | Selector = "r-map",
+    jpeg: bool = False,
     coarse_noise: NoiseModel | None = None,
     on_step: StepHook = ignore_step,
 ) -> Selection:
@@ -140,7 +142,7 @@ def select(
         raise NoUsablePatchesError(_nothing_usable(Counter(reasons.tolist())))
     score = chooser.score(windows.take(short), looked)
     order = np.argsort(-score, kind="stable")
-    short, score = short[order], score[order]
+    short, score = short[order], score[order] * (JPEG_WEIGHT if jpeg else 1.0)
     reasons[short] = "duplicate"
     patches = []
     for number, cell in enumerate(_spread(windows.take(short), count)):

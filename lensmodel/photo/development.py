@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from lensmodel.core.errors import (
     InvalidInputError,
     LensModelError,
+    MetadataMissingError,
     NotAnImageError,
     RawDecodeError,
     TruncatedImageError,
@@ -156,8 +157,12 @@ def develop(
     path, limits = Path(path), limits or Limits()
     with _opened(path, limits) as (said, raw):
         info = _info_of(path, said, raw, limits)
-        if on_info is not None:
-            on_info(info)
+        try:
+            if on_info is not None:
+                on_info(info)
+        except MetadataMissingError:  # of a photo that is damaged nobody shall look up what it does not say
+            _read_pixels(path, said.header) if raw is None else Mosaic.of(raw)
+            raise
         developed = _develop_raster(path, said, info) if raw is None else _develop_raw(raw, said, info)
     for remark in developed.remarks:
         remarks_log.warning("%s: %s", path.name, remark)
@@ -539,6 +544,10 @@ def _three_channels(pixels: Pixels) -> Pixels:
         pixels = pixels.astype(np.float32)
         known = pixels[np.isfinite(pixels)]
         pixels = np.nan_to_num(pixels, posinf=max(1.0, float(known.max(initial=0.0))), neginf=0.0)
+    elif pixels.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
+        raise UnsupportedFormatError(
+            f"samples of type {pixels.dtype} are not read; save it with 8 or 16 bits"
+        )
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.ndim != 3 or pixels.shape[2] > 4:

@@ -31,6 +31,7 @@ from lensmodel.core.types import (
     zone_of,
 )
 from lensmodel.model import LensModel, PsfAnswer
+from lensmodel.neural import RING_MIDDLES
 from lensmodel.quality import crossing, mtf50_from_kernel, mtf_from_kernel
 from lensmodel.report.centring import Centring, centring
 
@@ -71,7 +72,6 @@ UNKNOWN: Final = 0.5
 _ERRORS: Final = 2.0
 # Share of MTF50 of a chart, a target or points that it may be off by even there (chosen: as tests ask)
 _MEASURED: Final = 0.15
-_RINGS: Final = (np.arange(8) + 0.5) / 16.0  # middles of the rings of frequency whose error an answer says
 _SCALE: Final = np.linspace(0.0, 1.0, 513)  # cycles/pixel
 _TURNS: Final = (0.0, math.pi / 2.0)  # from u, to what is tangential and sagittal
 Range: TypeAlias = tuple[float, float]
@@ -388,7 +388,7 @@ def _mtf50(answer: PsfAnswer, angle: float, measured: bool) -> tuple[float, Rang
         low, high = max(value * (1.0 - share), 0.0), value * (1.0 + share)
     else:
         contrast = mtf_from_kernel(answer.kernel, angle, _SCALE)
-        error = _ERRORS * np.interp(_SCALE, _RINGS, answer.ring_error)
+        error = _ERRORS * np.interp(_SCALE, RING_MIDDLES, answer.ring_error)
         low, high = crossing(_SCALE, contrast - error, 0.5), crossing(_SCALE, contrast + error, 0.5)
     return min(value, NYQUIST), (min(low, NYQUIST), min(high, NYQUIST))
 

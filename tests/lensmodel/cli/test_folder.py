@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from datetime import datetime, timedelta
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -209,16 +210,22 @@ def test_a_name_of_a_lens_is_never_a_path() -> None:
     assert not group.name.startswith(".")
 
 
-def test_photos_far_apart_in_the_folder_are_learned_from_first() -> None:
-    (group,) = groups(shots(*[ZOOM] * 8))
+def test_the_frames_of_a_burst_are_one_scene_and_others_are_learned_from_first() -> None:
+    start = datetime(2024, 5, 1, 12, 0, 0)  # noqa: DTZ001 - cameras' clocks have no zone
+    taken = [replace(ZOOM, taken_at=start + timedelta(seconds=s)) for s in (0, 1, 2, 3, 60, 62, 90, 91)]
+    taken[6] = replace(taken[6], aperture=8.0)  # the last two are of two apertures: no burst
+    (group,) = groups(shots(*taken))
 
-    assert [path.name for path in group.to_learn_from()] == [f"{i}.dng" for i in (0, 4, 2, 6, 1, 5, 3, 7)]
+    assert group.scenes == 4
+    assert [path.name for path in group.to_learn_from()[:4]] == ["0.dng", "6.dng", "4.dng", "7.dng"]
+    assert len(group.to_learn_from()) == 8
+    assert groups(shots(ZOOM, ZOOM, ZOOM))[0].scenes == 3  # without a time
 
 
 def test_every_aperture_is_learned_from_before_any_is_twice() -> None:
     (group,) = groups(shots(*(replace(ZOOM, aperture=n) for n in (2.8, 2.8, 2.8, 8.0, 4.0))))
 
-    assert [path.name for path in group.to_learn_from()] == ["0.dng", "4.dng", "3.dng", "2.dng", "1.dng"]
+    assert [path.name for path in group.to_learn_from()] == ["0.dng", "4.dng", "3.dng", "1.dng", "2.dng"]
 
 
 # --- why a photo teaches nothing ----------------------------------------------------------------

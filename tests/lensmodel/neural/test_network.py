@@ -150,9 +150,14 @@ def test_no_samples_are_refused() -> None:
         FieldNetwork.load().memory(np.empty((0, 192)), np.empty((0, 2)), WIDE_OPEN)
 
 
-def test_statistics_of_a_wrong_shape_are_refused(sharp: np.ndarray) -> None:
+def test_statistics_of_a_wrong_shape_or_not_finite_are_refused(sharp: np.ndarray) -> None:
+    network = FieldNetwork.load()
     with pytest.raises(InvalidInputError, match=str(LENGTH)):
-        FieldNetwork.load().encode(sharp[:, :-1], PLACES, WIDE_OPEN)
+        network.encode(sharp[:, :-1], PLACES, WIDE_OPEN)
+    broken = sharp.copy()
+    broken[0, 0] = np.nan
+    with pytest.raises(InvalidInputError, match="finite"):
+        network.encode(broken, PLACES, WIDE_OPEN)
 
 
 def test_scaled_logits_raise_kernels_to_powers(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -146,11 +146,18 @@ def test_a_memory_mapped_plane_gives_the_same_and_progress_is_reported_to_the_en
 
 
 @pytest.mark.parametrize("selector", list(selectors))
-def test_scores_lie_in_zero_to_one(part: Plane, selector: str) -> None:
-    found = select(part, NOISE, Frame(480, 640), count=12, selector=selector).patches
+def test_scores_lie_in_zero_to_one_and_jpeg_counts_for_less(part: Plane, selector: str) -> None:
+    raw, jpeg = (
+        [
+            p.score
+            for p in select(part, NOISE, Frame(480, 640), count=12, selector=selector, jpeg=jpeg).patches
+        ]
+        for jpeg in (False, True)
+    )
 
-    assert len({patch.score for patch in found}) > 1
-    assert all(0.0 < patch.score <= 1.0 for patch in found)
+    assert len(set(raw)) > 1
+    assert all(0.0 < score <= 1.0 for score in raw)
+    assert jpeg == pytest.approx([0.3 * score for score in raw])
 
 
 # ---- what is rejected

@@ -23,8 +23,10 @@ from lensmodel.core.errors import (
     DecompressionBombError,
     ImageTooLargeError,
     LensModelError,
+    MetadataMissingError,
     NotAnImageError,
     TruncatedImageError,
+    UnreadablePhotoError,
     UnsupportedFormatError,
 )
 from lensmodel.photo.colour import matrix_profile, named_profile
@@ -509,6 +511,22 @@ def test_a_file_that_was_cut_off_is_refused_before_it_is_decoded(
     path.write_bytes(data[: int(share * len(data))])
     with pytest.raises((TruncatedImageError, NotAnImageError)):
         photo.inspect(path)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "DNG"])
+def test_of_a_damaged_photo_the_damage_is_said_and_not_what_else_it_lacks(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "damaged"
+    data = bytearray(_whole(kind, path))
+    middle = len(data) // 3
+    data[middle:-30] = bytes(len(data) - 30 - middle)  # not the end chunk
+    path.write_bytes(data)
+    photo.inspect(path)  # nothing in its header shows it
+
+    def refused(info: photo.PhotoInfo) -> None:
+        raise MetadataMissingError("it does not say its aperture")
+
+    with pytest.raises(UnreadablePhotoError):
+        photo.develop(path, on_info=refused)
 
 
 def test_a_tiff_whose_directories_form_a_loop_is_read_once(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ class KnownLens:
     @property
     def settings(self) -> LensSettings:
         """Wide open."""
-        return LensSettings(aperture=self.lens.widest())
+        return LensSettings(aperture=self.lens.f_number(LensSettings()))
 
     def shot(self, number: int, path: Path, crop: float = 1.0) -> Planes:
         """Take a photo as a DNG file, or its middle; return the sharp light behind it."""

@@ -99,14 +99,14 @@ def run(output: Path, say: Say) -> bool:
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="lensmodel-demo-") as folder:
         work = Path(folder)
-        say(f"Photographing 5 scenes through the simulated lens {LENS.model} ...")
+        say(f"Photographing 5 scenes through the simulated lens {LENS.identity.model} ...")
         names = enumerate((*LEARN_FROM, HELD_OUT, CHART))
         sharp = {name: _taken(name, work, number) for number, name in names}
         say("Starting the service ...")
         with own_service(work / "data", output / "service.log") as client:
             improved, tables = _learned(client, work, sharp[HELD_OUT], output, say)
             say("Stopping the service ...")
-    tables |= {"verdict": "better" if improved else "NOT better", "lens": LENS.model}
+    tables |= {"verdict": "better" if improved else "NOT better", "lens": str(LENS.identity.model)}
     tables |= {"seconds": f"{time.monotonic() - began:.0f}", "aperture": f"{SETTINGS.aperture:g}"}
     (output / "report.md").write_text(_REPORT.format(**tables), encoding="utf-8")
     say(f"Report: {output / 'report.md'}")

@@ -101,10 +101,7 @@ def _without_box(plane: NDArray[np.float64]) -> NDArray[np.float32]:
 def true_mtf50(lens: CameraLens, place: FieldPosition, normal: float, pitch_um: float) -> float:
     """MTF50 in cycles/pixel of the lens's own green kernel along a normal, by a plain sum over its pixels."""
     h = (place.r * math.cos(place.phi), place.r * math.sin(place.phi))
-    kernel = lens.kernel_at_field(
-        h, LensSettings(aperture=lens.widest(), channel="g"), _SIZE,
-        pitch_um=pitch_um, offset=(0.0, 0.0),
-    )  # fmt: skip
+    kernel = lens.kernel_at_field(h, LensSettings(), _SIZE, pitch_um=pitch_um, offset=(0.0, 0.0))
     t = np.arange(_SIZE) - _SIZE // 2
     along = t[None, :] * math.cos(normal) - t[:, None] * math.sin(normal)
     frequencies = np.linspace(0.0, 0.75, 751)
@@ -139,7 +136,8 @@ def main() -> None:
     if asked.photos:
         ways[f"{asked.photos} photos"] = by_photos(lens, asked.photos, pitch_um)
     print(
-        f"{lens.model}, MTF50 in cycles/pixel: median of a zone, its truth, how far off half the places are"
+        f"{lens.identity.model}, MTF50 in cycles/pixel: median of a zone, its truth, how far off half of "
+        "the places are"
     )
     for zone in ZONES:
         for way, found in ways.items():
@@ -155,7 +153,7 @@ def by_chart(lens: GridLens, pitch_um: float) -> list[Sharpness]:
     """Photograph the chart through the lens, and measure it."""
     camera = SimulatedCamera(height=2000, width=3000, pitch_um=pitch_um)
     scene, _ = squares_chart(camera.frame)
-    shot = photograph(scene, lens, LensSettings(aperture=lens.widest()), camera, np.random.default_rng(0))
+    shot = photograph(scene, lens, LensSettings(), camera, np.random.default_rng(0))
     with tempfile.TemporaryDirectory() as folder:
         write_photo(Path(folder) / "chart.dng", shot)
         photo = develop(Path(folder) / "chart.dng")

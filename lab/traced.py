@@ -19,6 +19,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 from lensmodel.core.psf import as_kernel, centroid, resized
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings
+from lensmodel.photo.values import LensIdentity
 from lensmodel.simulate import SimulatedLens, draw_lens
 
 FORMAT: Final = 1  # raised when files of an older form can no longer be read
@@ -124,7 +125,6 @@ class GridLens:
     """A traced lens in front of a simulated camera, at the aperture that it has a grid for."""
 
     grid: GridField
-    maker: str = "Traced Optics"  # as written into the metadata of its photos
     serial: str = "TRC0000001"
 
     @classmethod
@@ -138,18 +138,15 @@ class GridLens:
         return str(self.grid.facts["design"])
 
     @property
-    def model(self) -> str:
+    def identity(self) -> LensIdentity:
         """As written into the metadata of its photos."""
-        return f"Traced {self.design.title()} {self.focal_mm[0]:.0f}mm f/{self.widest():g}"
+        model = f"Traced {self.design.title()} {self.focal_mm[0]:.0f}mm f/{self.grid.f_number:g}"
+        return LensIdentity("Traced Optics", model, self.serial, "exif")
 
     @property
     def focal_mm(self) -> tuple[float, ...]:
         """The focal length, rounded to a tenth of a millimetre as lenses tell it."""
         return (round(float(self.grid.facts["focal_mm"]), 1),)
-
-    def widest(self, focal_mm: float | None = None) -> float:
-        """Its aperture."""
-        return self.grid.f_number
 
     def f_number(self, settings: LensSettings) -> float:
         """Working f-number of the settings; unknown means its own, and no other is known."""
@@ -194,7 +191,7 @@ def known_lens(seed: int, grid: Path | None = None) -> SimulatedLens | GridLens:
 
 def wide_open(lens: SimulatedLens | GridLens) -> LensSettings:
     """Settings of photos with the widest aperture of the shortest focal length."""
-    return LensSettings(aperture=lens.widest(lens.focal_mm[0]), focal_mm=lens.focal_mm[0])
+    return LensSettings(aperture=lens.f_number(LensSettings()), focal_mm=lens.focal_mm[0])
 
 
 def _centred(kernel: Kernel) -> Kernel:

@@ -130,7 +130,7 @@ class Case:
     @property
     def title(self) -> str:
         """For people."""
-        model = self.lens.model.removeprefix("Simulated ")
+        model = str(self.lens.identity.model).removeprefix("Simulated ")
         return f"{model} at {self.settings.focal_mm:.3g} mm f/{self.settings.aperture:.2g}"
 
     @property

@@ -67,9 +67,10 @@ def psf_of(wanted: Wanted) -> tuple[Kernel, str]:
     place, found = FieldPosition(wanted.r, math.radians(wanted.phi_degrees)), []
     for seed in range(FIRST_SEED, FIRST_SEED + COPIES):
         lens = draw_lens(seed, wanted.kind)
-        settings = LensSettings(aperture=lens.widest(), channel="g")
+        widest = lens.f_number(LensSettings())
+        settings = LensSettings(aperture=widest, channel="g")
         kernel = psf.centred(lens.kernel(place, settings, size=PSF_SIZE, pitch_um=wanted.pitch_um))
-        found.append((abs(math.log(psf.rms_width(kernel) / wanted.width_px)), seed, lens.widest(), kernel))
+        found.append((abs(math.log(psf.rms_width(kernel) / wanted.width_px)), seed, widest, kernel))
     _, seed, f_number, kernel = min(found, key=lambda copy: copy[:2])
     facts = (
         f"kind {wanted.kind}, seed {seed}, f_number {f_number}, r {wanted.r}, "

@@ -9,14 +9,7 @@ from lensmodel.simulate.lens import (
     SimulatedLens,
     draw_lens,
 )
-from lensmodel.simulate.scenes import (
-    DEMO_SCENES,
-    demo_data_path,
-    demo_scene,
-    edge_chart,
-    load_scene,
-    slanted_edge_scene,
-)
+from lensmodel.simulate.scenes import DEMO_SCENES, demo_data_path, demo_scene, edge_chart, load_scene
 
 __all__ = [
     "DEMO_SCENES",
@@ -34,6 +27,5 @@ __all__ = [
     "edge_chart",
     "load_scene",
     "photograph",
-    "slanted_edge_scene",
     "write_photo",
 ]

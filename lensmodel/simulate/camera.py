@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import CHANNELS, Channel, Frame, LensSettings, NoiseModel, Planes
-from lensmodel.photo.values import LensIdentity, PhotoMetadata
+from lensmodel.photo.values import PhotoMetadata
 from lensmodel.photo.writing import BAYER_PATTERNS, XYZ_TO_SRGB, write_bayer_dng
 from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, CameraLens
 
@@ -257,7 +257,7 @@ def write_photo(path: str | Path, photo: SimulatedPhoto) -> None:
         camera_maker=camera.maker,
         camera_model=camera.model,
         body_serial=camera.serial,
-        lens=LensIdentity(lens.maker, lens.model, lens.serial, "exif"),
+        lens=lens.identity,
         aperture=round(lens.f_number(settings), 2),
         focal_mm=settings.focal_mm if settings.focal_mm is not None else lens.focal_mm[0],
         focus_m=settings.focus_m,

@@ -41,10 +41,23 @@ from scipy import fft
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import as_kernel, centroid
 from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, LensSettings
+from lensmodel.photo.values import LensIdentity
 
 DEFAULT_PITCH_UM: Final = 4.5  # micrometres: a full-frame sensor of 42 megapixels
 DEFAULT_SIZE: Final = 55  # pixels: the largest kernel that the paper estimates
+SMALLEST_F: Final = 32.0  # largest f-number that any simulated lens can be set to
+REFERENCE_UM: Final = 0.54  # wavelength in micrometres in which wavefront errors are counted
 _BAND_UM: Final = 0.035  # half the distance between the outer wavelengths of one colour channel
+_MIN_SAMPLES: Final = 96  # across the pupil, to draw its edge well
+_MAX_SAMPLES: Final = 640  # across the transform: memory (chosen)
+_WRAP_MARGIN: Final = 1.2  # period of the discrete transform over the extent of the light
+_CENTRED_PX: Final = 5e-4  # pixels: far below what any test asks
+_DETAILED_CUTOFF: Final = 3.5  # cycles/pixel
+
+_IDENTITY: Final = LensIdentity("Simulated Optics", "Simulated 50mm f/2", "SIM0000001", "exif")
+
+Vector: TypeAlias = tuple[float, float]
+"""Of the field or pupil `(right, up)`, or in pixels `(row, col)`; also two coefficients that go together."""
 
 
 class CameraLens(Hashable, Protocol):
@@ -55,31 +68,14 @@ class CameraLens(Hashable, Protocol):
         """Ascending focal lengths; one for a prime lens."""
 
     @property
-    def maker(self) -> str:
+    def identity(self) -> LensIdentity:
         """As written into the metadata of its photos."""
-
-    @property
-    def model(self) -> str:
-        """As written into the metadata of its photos."""
-
-    @property
-    def serial(self) -> str:
-        """As written into the metadata of its photos."""
-
-    def widest(self, focal_mm: float | None = None) -> float:
-        """Widest aperture at a focal length; None means the shortest."""
 
     def f_number(self, settings: LensSettings) -> float:
-        """Working f-number of the settings; unknown means wide open."""
+        """Working f-number of the settings; unknown means wide open, at the shortest focal length."""
 
     def kernel_at_field(
-        self,
-        h: tuple[float, float],
-        settings: LensSettings,
-        size: int,
-        *,
-        pitch_um: float,
-        offset: tuple[float, float],
+        self, h: Vector, settings: LensSettings, size: int, *, pitch_um: float, offset: Vector
     ) -> Kernel:
         """Kernel at field vector `h` (right, up), its centre of mass at `offset` (row, col) pixels."""
 
@@ -94,9 +90,7 @@ class SimulatedLens:
     # one for every entry of `focal_mm`; between them a zoom interpolates in log focal length
     optics: tuple[Aberrations, ...]
     focal_mm: tuple[float, ...] = (50.0,)  # ascending focal lengths; one for a prime lens
-    maker: str = "Simulated Optics"  # as written into the metadata of its photos
-    model: str = "Simulated 50mm f/2"
-    serial: str = "SIM0000001"
+    identity: LensIdentity = _IDENTITY
 
     def __post_init__(self) -> None:
         ascending = [0.0, *self.focal_mm] == sorted({0.0, *self.focal_mm})
@@ -105,9 +99,8 @@ class SimulatedLens:
 
     def at_focal(self, focal_mm: float | None = None) -> Aberrations:
         """Optics at a focal length; None means the shortest."""
-        if focal_mm is None:
-            return self.optics[0]
         first, last = self.focal_mm[0], self.focal_mm[-1]
+        focal_mm = first if focal_mm is None else focal_mm
         if not first * 0.999 <= focal_mm <= last * 1.001:
             raise InvalidInputError(f"the lens covers {first:g} to {last:g} mm, got {focal_mm:g}")
         places = np.arange(len(self.focal_mm))
@@ -115,12 +108,8 @@ class SimulatedLens:
         lower = self.optics[int(below)]
         return lower.mixed(self.optics[int(below) + 1], share) if share else lower
 
-    def widest(self, focal_mm: float | None = None) -> float:
-        """Widest aperture at a focal length; None means the shortest."""
-        return self.at_focal(focal_mm).f_number
-
     def f_number(self, settings: LensSettings) -> float:
-        """Working f-number of the settings; unknown means wide open."""
+        """Working f-number of the settings; unknown means wide open, at the shortest focal length."""
         widest = self.at_focal(settings.focal_mm).f_number
         if settings.aperture is None:
             return widest
@@ -143,12 +132,12 @@ class SimulatedLens:
 
     def kernel_at_field(
         self,
-        h: tuple[float, float],
+        h: Vector,
         settings: LensSettings,
         size: int,
         *,
         pitch_um: float = DEFAULT_PITCH_UM,
-        offset: tuple[float, float] = (0.0, 0.0),
+        offset: Vector = (0.0, 0.0),
     ) -> Kernel:
         """Kernel at field vector `h` (right, up), also outside the frame; see `CameraLens`."""
         if not 0.5 <= pitch_um <= 50.0:
@@ -167,8 +156,8 @@ class SimulatedLens:
     def lateral_shift(self, r: float, channel: Channel, focal_mm: float | None = None) -> float:
         """Displacement of a channel's image against green at radius `r`, outwards, in half diagonals."""
         optics = self.at_focal(focal_mm)
-        terms = {"r": optics.lateral_red, "g": (0.0, 0.0), "b": optics.lateral_blue}[channel]
-        return terms[0] * r + terms[1] * r**3
+        c1, c3 = {"r": optics.lateral_red, "g": (0.0, 0.0), "b": optics.lateral_blue}[channel]
+        return c1 * r + c3 * r**3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,14 +177,6 @@ def _kernel(lens: SimulatedLens, position: FieldPosition, settings: LensSettings
     return lens.kernel(position, settings, size)
 
 
-REFERENCE_UM: Final = 0.54  # wavelength in micrometres in which wavefront errors are counted
-_MIN_SAMPLES: Final = 96  # across the pupil, to draw its edge well
-_MAX_SAMPLES: Final = 640  # across the transform: memory (chosen)
-_WRAP_MARGIN: Final = 1.2  # period of the discrete transform over the extent of the light
-_CENTRED_PX: Final = 5e-4  # pixels: far below what any test asks
-_DETAILED_CUTOFF: Final = 3.5  # cycles/pixel
-
-
 def coordinates(samples: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Pupil coordinates px `(1, samples)` to the right and py `(samples, 1)` upwards."""
     p = ((np.arange(samples) - (samples - 1) / 2.0) * step).astype(np.float32)
@@ -211,7 +192,7 @@ class PixelOtf:
     values: NDArray[np.complex64]
     period: float  # period in pixels of the image that it describes: frequencies are multiples of 1 / period
 
-    def kernel(self, size: int, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
+    def kernel(self, size: int, shift: Vector = (0.0, 0.0)) -> NDArray[np.float64]:
         """Share of the light in `(size, size)` pixels, the image moved by `shift` (row, col) pixels."""
         rows, half = self.values.shape
         x = np.arange(size) - size // 2
@@ -223,7 +204,7 @@ class PixelOtf:
         light = ((along_rows @ self.values) @ along_cols).real.astype(np.float64)
         return light / self.period**2
 
-    def centred(self, size: int, guess: tuple[float, float], offset: tuple[float, float]) -> Kernel:
+    def centred(self, size: int, guess: Vector, offset: Vector) -> Kernel:
         """Kernel whose centre of mass, unshifted near `guess`, is at `offset` (row, col) from the middle."""
         shift = (offset[0] - guess[0], offset[1] - guess[1])
         light = np.empty(0)
@@ -239,7 +220,7 @@ class PixelOtf:
 
 def pixel_otf(
     pupil: Pupil,
-    spectrum: Sequence[tuple[float, float]],
+    spectrum: Sequence[Vector],
     *,
     size: int,
     pitch_um: float,
@@ -281,9 +262,6 @@ def pixel_otf(
     return PixelOtf(otf, period)
 
 
-SMALLEST_F: Final = 32.0  # largest f-number that any simulated lens can be set to
-
-
 @dataclass(frozen=True, slots=True)
 class Aberrations:
     """The optics of one copy at one focal length; wavefront terms in waves of 540 nm at `f_number`."""
@@ -295,17 +273,17 @@ class Aberrations:
     field_curvature: float = 0.0
     defocus: float = 0.0
     # where the centre of symmetry lies, (right, up), in half diagonals
-    decentring: tuple[float, float] = (0.0, 0.0)
+    decentring: Vector = (0.0, 0.0)
     # faults that are the same all over the field: vector (right, up); (a, b)
-    uniform_coma: tuple[float, float] = (0.0, 0.0)
-    uniform_astigmatism: tuple[float, float] = (0.0, 0.0)
-    tilt: tuple[float, float] = (0.0, 0.0)  # defocus per unit of field towards (right, up)
-    colour_focus: tuple[float, float] = (0.0, 0.0)  # longitudinal colour: c1, c2
+    uniform_coma: Vector = (0.0, 0.0)
+    uniform_astigmatism: Vector = (0.0, 0.0)
+    tilt: Vector = (0.0, 0.0)  # defocus per unit of field towards (right, up)
+    colour_focus: Vector = (0.0, 0.0)  # longitudinal colour: c1, c2
     # cat's eye: radius of the second circle over that of the pupil, 0 for none, and its shift a unit of field
-    vignetting: tuple[float, float] = (0.0, 0.0)
+    vignetting: Vector = (0.0, 0.0)
     # lateral colour against green: displacement outwards = c1 r + c3 r^3 in half diagonals
-    lateral_red: tuple[float, float] = (0.0, 0.0)
-    lateral_blue: tuple[float, float] = (0.0, 0.0)
+    lateral_red: Vector = (0.0, 0.0)
+    lateral_blue: Vector = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not (0.7 <= self.f_number <= SMALLEST_F and np.isfinite(np.hstack(astuple(self))).all()):
@@ -324,14 +302,14 @@ class Pupil:
     """The pupil of one place and aperture: W(p) as a polynomial, and what it lets through (cat's eye)."""
 
     quartic: float  # |p|^4
-    cubic: tuple[float, float]  # (c.p) |p|^2
+    cubic: Vector  # (c.p) |p|^2
     quadratic: tuple[float, float, float]  # px^2, px py, py^2
-    colour: tuple[float, float]  # c1 t + c2 t^2 on |p|^2
+    colour: Vector  # c1 t + c2 t^2 on |p|^2
     radius: float  # of the second circle and its centre, in units of the stop; 0 = none
-    center: tuple[float, float]
+    center: Vector
 
     @classmethod
-    def of(cls, optics: Aberrations, h: tuple[float, float], f_number: float) -> Pupil:
+    def of(cls, optics: Aberrations, h: Vector, f_number: float) -> Pupil:
         """Collect the terms at field vector `h` and aperture `f_number`."""
         s = optics.f_number / f_number
         x, y = h[0] - optics.decentring[0], h[1] - optics.decentring[1]
@@ -395,7 +373,7 @@ class Pupil:
             return stop
         return stop * disc(self.radius, *self.center)
 
-    def ray_spot(self, wavelength_um: float, f_number: float) -> tuple[tuple[float, float], float]:
+    def ray_spot(self, wavelength_um: float, f_number: float) -> tuple[Vector, float]:
         """Centre of the ray spot (right, up) and its largest radius, in micrometres."""
         step = 2.0 / 48
         px, py = coordinates(48, step)
@@ -407,8 +385,6 @@ class Pupil:
         radius = float((np.hypot(gx - x, gy - y) * (light > 0)).max())
         return (scale * x, scale * y), scale * radius
 
-
-_Range: TypeAlias = tuple[float, float]
 
 _USUAL: Final = {
     "spherical": 1.0,
@@ -426,7 +402,7 @@ _FAST: Final = (1.8, 2.0, 2.8)
 _SHARP: Final = (0.3, 0.7)
 # Of each kind: its f-numbers; the r.m.s. widths of the ray spot at the centre and at r = 1 (mean over phi) in
 # pixels of 4.5 um, from and to; and what is not as usual, a number, or from and to.
-_KINDS: Final[Mapping[str, tuple[Sequence[float], _Range, _Range, Mapping[str, float | _Range]]]] = {
+_KINDS: Final[Mapping[str, tuple[Sequence[float], Vector, Vector, Mapping[str, float | Vector]]]] = {
     "soft-fast": ((1.4, 1.6, 1.8), (0.9, 1.4), (2.2, 4.2), {"coma": 1.5}),
     "coma": ((1.8, 2.0, 2.4), _SHARP, (1.3, 3.0), {"coma": 3.0, "astigmatism": 0.4, "field_curvature": 0.3}),
     "astigmatism": (
@@ -466,7 +442,8 @@ def draw_lens(seed: int, kind: str | None = None) -> SimulatedLens:
         # a shifted element stays where it is when one zooms
         optics.append(replace(tele, decentring=optics[0].decentring, tilt=optics[0].tilt))
     name = f"Simulated {kind.title()} {'-'.join(f'{mm:.0f}' for mm in focals)}mm f/{f_number:g}"
-    return SimulatedLens(tuple(optics), focals, model=name, serial=f"SIM{seed:07d}")
+    identity = LensIdentity("Simulated Optics", name, f"SIM{seed:07d}", "exif")
+    return SimulatedLens(tuple(optics), focals, identity)
 
 
 def _optics(
@@ -484,7 +461,7 @@ def _optics(
     )
     angle = rng.uniform(0.0, 2.0 * math.pi, size=4)
 
-    def vector(k: int, length: float) -> tuple[float, float]:
+    def vector(k: int, length: float) -> Vector:
         return length * math.cos(angle[k]), length * math.sin(angle[k])
 
     center = Aberrations(f_number=f_number, spherical=spherical, defocus=-1.1 * spherical)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
 from itertools import product
@@ -10,7 +11,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
@@ -71,15 +71,6 @@ class Chart:
     edges: tuple[ChartEdge, ...]  # in coordinates of the frame, margin not counted
 
 
-def slanted_edge_scene(
-    height: int, width: int, normal: float, *, dark: float = 0.2, bright: float = 0.8
-) -> NDArray[np.float32]:
-    """One plane with one edge through its middle; see `edge_area`."""
-    rows = (np.arange(height) - (height - 1) / 2.0)[:, None]
-    cols = (np.arange(width) - (width - 1) / 2.0)[None, :]
-    return (dark + (bright - dark) * edge_area(rows, cols, normal)).astype(np.float32)
-
-
 def edge_chart(frame: Frame, *, margin: int = 40, guard: int = 27) -> Chart:
     """Chart with edges in the centre, half way out and in all four corners, of both directions."""
     tile = min(frame.height // 6, frame.width // 8)
@@ -92,35 +83,29 @@ def edge_chart(frame: Frame, *, margin: int = 40, guard: int = 27) -> Chart:
     dark, bright = 0.15, 0.75
     shape = (frame.height + 2 * margin, frame.width + 2 * margin)
     plane = np.full(shape, (dark + bright) / 2.0, dtype=np.float32)
-    edges = []
+    middle, edges = (tile - 1) / 2.0, []
+    t = np.arange(tile) - middle
     for up, right, direction in _places(frame, tile):
-        row = round(frame.center[0] - up - (tile - 1) / 2.0)
-        col = round(frame.center[1] + right - (tile - 1) / 2.0)
-        position = frame.position(row + (tile - 1) / 2.0, col + (tile - 1) / 2.0)
+        row, col = round(frame.center[0] - up - middle), round(frame.center[1] + right - middle)
+        position = frame.position(row + middle, col + middle)
         normal = _slanted(position.phi + (math.pi / 2.0 if direction == "sagittal" else 0.0))
         top, left = row + margin, col + margin
-        plane[top : top + tile, left : left + tile] = slanted_edge_scene(
-            tile, tile, normal, dark=dark, bright=bright
-        )
+        share = edge_area(t[:, None], t[None, :], normal)
+        plane[top : top + tile, left : left + tile] = dark + (bright - dark) * share
         edges.append(ChartEdge((row + guard, col + guard, box, box), normal, position, direction))
     return Chart(np.ascontiguousarray(np.broadcast_to(plane, (3, *plane.shape))), tuple(edges))
 
 
-def _places(frame: Frame, tile: int) -> list[tuple[float, float, Direction]]:
-    """Middles of the tiles as (up, right) from the centre, with their direction."""
-    half_h, half_w = frame.height / 2.0, frame.width / 2.0
-    places: list[tuple[float, float, Direction]] = [
-        (0.0, -0.55 * tile, "tangential"),
-        (0.0, 0.55 * tile, "sagittal"),
-    ]
+def _places(frame: Frame, tile: int) -> Iterator[tuple[float, float, Direction]]:
+    """Yield the middles of the tiles as (up, right) from the centre, with their direction."""
+    yield 0.0, -0.55 * tile, "tangential"
+    yield 0.0, 0.55 * tile, "sagittal"
+    top, side = frame.height / 2.0, frame.width / 2.0
     for up, right in product((1.0, -1.0), (1.0, -1.0)):
-        places += [
-            (up * (half_h - 0.5 * tile), right * (half_w - 0.5 * tile), "tangential"),
-            (up * (half_h - 1.5 * tile), right * (half_w - 0.5 * tile), "sagittal"),
-            (up * (half_h - 1.5 * tile), right * half_w / 2.0, "tangential"),
-            (up * (half_h - 2.5 * tile), right * half_w / 2.0, "sagittal"),
-        ]
-    return places
+        yield up * (top - 0.5 * tile), right * (side - 0.5 * tile), "tangential"
+        yield up * (top - 1.5 * tile), right * (side - 0.5 * tile), "sagittal"
+        yield up * (top - 1.5 * tile), right * side / 2.0, "tangential"
+        yield up * (top - 2.5 * tile), right * side / 2.0, "sagittal"
 
 
 def _slanted(angle: float) -> float:

@@ -102,7 +102,7 @@ def test_photo_of_a_lens_known_from_one_other_photo_is_better_and_nowhere_worse(
 def cropped(tmp_path_factory: pytest.TempPathFactory) -> tuple[LensModel, Path, Planes]:
     """A lens known from a whole frame, a photo of the middle of another one, and the truth of that."""
     folder = tmp_path_factory.mktemp("cropped")
-    known, asked = (shot(CROP_LENS, CROP_LENS.widest(), scene) for scene in ("city", "colosseum"))
+    known, asked = (shot(CROP_LENS, CROP_LENS.at_focal().f_number, scene) for scene in ("city", "colosseum"))
     middle = slice(106, 534), slice(160, 800)  # the smaller of two usual sensors, as crop mode cuts it
     simulate.write_photo(folder / "known.dng", known)
     part = replace(asked, mosaic=np.ascontiguousarray(asked.mosaic[middle]))
@@ -119,7 +119,7 @@ def test_a_frame_in_crop_mode_gains_in_every_zone_by_the_kernels_of_its_place(
     model, path, truth = cropped
     developed = photo.develop(path)
 
-    settings, lateral = LensSettings(aperture=CROP_LENS.widest()), api.lateral_of(developed)
+    settings, lateral = LensSettings(aperture=CROP_LENS.at_focal().f_number), api.lateral_of(developed)
     made = api.correct_photo(developed, model, settings, method=method, lateral=lateral).planes
 
     found = gains(*map(shown, (developed.planes, made, truth)))

@@ -63,7 +63,7 @@ def traced(path: Path = HELIAR, **changes: Any) -> Case:
 
 def test_plan_has_eight_kinds_of_lenses_of_both_families_and_says_which_were_looked_at() -> None:
     drawn = [one for one in planned("default").cases if one.grid is None]
-    assert len({one.lens.model.split()[1] for one in drawn}) == len(LENS_KINDS) == 8
+    assert len({one.lens.identity.model.split()[1] for one in drawn}) == len(LENS_KINDS) == 8
     assert min(one.seed for one in drawn) >= cases.FIRST_SEED
     quick = planned("quick").cases
     assert [one.family for one in quick] == ["third order"] * 2 + ["ray-traced"] * 2
@@ -127,8 +127,8 @@ def test_general_profile_of_a_drawn_lens_is_the_mean_of_development_lenses_of_it
     field = general_field(one)
     assert isinstance(field, MeanField)
     lenses = [each.lens for each in field.fields]  # type: ignore[attr-defined]  # simulated fields
-    assert {lens.model.split()[1] for lens in lenses} == {one.lens.model.split()[1]}
-    assert max(int(lens.serial.removeprefix("SIM")) for lens in lenses) < 100
+    assert {lens.identity.model.split()[1] for lens in lenses} == {one.lens.identity.model.split()[1]}
+    assert max(int(lens.identity.serial.removeprefix("SIM")) for lens in lenses) < 100
     mean = np.mean([each.kernel_at(place, "g", 21) for each in field.fields], axis=0)
     np.testing.assert_allclose(field.kernel_at(place, "g", 21), mean / mean.sum())
 

@@ -60,7 +60,7 @@ def test_a_scene_out_of_focus_does_not_lose_by_a_kernel_that_is_too_wide(
 def test_noise_of_a_developed_mosaic_is_spread_as_it_is_reckoned_with(tmp_path: Path) -> None:
     camera, lens = SimulatedCamera(height=960, width=960, full_well_electrons=20_000.0), draw_lens(3)
     even = np.full((3, 1040, 1040), 0.1, dtype=np.float32)
-    settings = LensSettings(aperture=lens.widest())
+    settings = LensSettings(aperture=lens.at_focal().f_number)
     rng = np.random.default_rng(2)
     # no blur shows on an even scene
     write_photo(tmp_path / "even.dng", photograph(even, lens, settings, camera, rng, size=9, step=0.5))

@@ -116,7 +116,7 @@ def test_the_fine_detail_of_an_xtrans_photo_is_no_damage(tmp_path: Path) -> None
 def test_defects_cost_the_whole_chain_nothing(xtrans: bool, tmp_path: Path) -> None:
     camera = simulate.SimulatedCamera(height=576, width=720, full_well_electrons=20_000.0)
     lens = simulate.draw_lens(1001)
-    settings = LensSettings(aperture=lens.widest())
+    settings = LensSettings(aperture=lens.at_focal().f_number)
     filters = colours_of(XTRANS if xtrans else BAYER, (576, 720)).astype(np.intp)[None]
     balance = np.reshape(camera.white_balance, (3, 1, 1))
     shots = [

@@ -370,8 +370,8 @@ def test_written_photo_opens_in_libraw_with_its_lens_and_its_colours(tmp_path: P
     np.testing.assert_allclose(developed[32, 48] / 65535, [0.6, 0.3, 0.1], atol=3e-3)
     with (tmp_path / "photo.dng").open("rb") as file:
         tags = exifread.process_file(file)
-    assert str(tags["EXIF LensSerialNumber"]) == zoom.serial
-    assert str(tags["EXIF LensModel"]) == zoom.model
+    assert str(tags["EXIF LensSerialNumber"]) == zoom.identity.serial
+    assert str(tags["EXIF LensModel"]) == zoom.identity.model
     assert str(tags["EXIF ISOSpeedRatings"]) == "200"
 
 

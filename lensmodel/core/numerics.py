@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable
 from typing import Any, Final, TypeAlias, TypeVar, cast
@@ -24,8 +23,7 @@ def jit(function: F) -> F:
 
 _Vector: TypeAlias = NDArray[np.float64]
 
-_LEAST: Final = 1e-6  # of the largest eigenvalue: the least that is left (chosen, far below any noise)
-_FEW: Final = 256  # unknowns up to which all eigenvalues take no longer than the largest and least (chosen)
+_LIFT: Final = 1e-6  # of the largest eigenvalue, by which all are lifted (chosen, far below any noise)
 
 
 def nonnegative_least_squares(
@@ -34,14 +32,14 @@ def nonnegative_least_squares(
     """Minimise k'Ak/2 - b'k over k >= 0 by FISTA; scipy's `nnls` wants the matrix of residuals."""
     if not a.any():
         return start.copy()
-    largest, lift = _largest_and_lift(a)
-    return fista(
-        lambda k: _product(a, k) + lift * k - b,
-        start,
-        1.0 / (largest + lift),
-        lambda k: np.maximum(k, 0.0),
-        steps=steps,
-    )
+    first = np.ones(len(a))  # else a random one
+    largest = float(scipy.sparse.linalg.eigsh(a, 1, v0=first, return_eigenvectors=False)[0])
+    lift, transposed = _LIFT * largest, a.T
+
+    def gradient(k: _Vector) -> _Vector:
+        return np.asarray(scipy.linalg.blas.dsymv(1.0, transposed, k)) + lift * k - b  # reads half of A
+
+    return fista(gradient, start, 1.0 / (largest + lift), lambda k: np.maximum(k, 0.0), steps=steps)
 
 
 def fista(
@@ -68,26 +66,6 @@ def fista(
         if moved < still:
             break
     return k
-
-
-def _largest_and_lift(a: NDArray[np.float64]) -> tuple[float, float]:
-    """Largest eigenvalue, and what all are lifted by so that none is below `_LEAST` of that."""
-    # all eigenvalues take ten times as long as a Cholesky factor, which tells of small ones
-    if len(a) > _FEW:
-        start = np.ones(len(a))
-        largest = float(scipy.sparse.linalg.eigsh(a, 1, v0=start, return_eigenvectors=False)[0])
-        with contextlib.suppress(np.linalg.LinAlgError):
-            least = _LEAST * largest * np.eye(len(a))
-            scipy.linalg.cholesky(a - least, overwrite_a=True, check_finite=False)
-            return largest, 0.0
-    eigenvalues = np.linalg.eigvalsh(a)
-    largest = float(eigenvalues[-1])
-    return largest, max(_LEAST * largest - float(eigenvalues[0]), 0.0)
-
-
-def _product(a: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A k of a symmetric matrix; of a large one only a half is read."""
-    return np.asarray(scipy.linalg.blas.dsymv(1.0, a.T, k) if len(a) > _FEW else a @ k)
 
 
 def on_simplex(values: NDArray[np.float64], total: float) -> NDArray[np.float64]:

@@ -81,8 +81,7 @@ def calibrate(
     with shown.progress(total=len(paths)) as bar:
 
         def on_event(event: CalibrationEvent) -> None:
-            text = f"{event.photo.name}: {event.stage}"
-            bar.part(len(results), event.done, event.total, description=text)
+            bar.part(len(results), event.done, event.total, f"{event.photo.name}: {event.stage}")
 
         with executor_of(scheduler) as (executor, ahead), processes.pool(None, workers) as pool:
             calibration = Calibration(store, config, any_lens=any_lens, pool=pool)
@@ -94,8 +93,10 @@ def calibrate(
                 elif event.stage == "skipped":
                     result = {"state": "known"}
                     shown.note(f"{event.photo}: the profile has it already")
+                else:
+                    shown.detail(f"{event.photo}: {event.total} samples")
                 results.append({"photo": str(event.photo), **result})
-                bar.show(completed=len(results))
+                bar.show(len(results))
     lens = calibration.known
     coverage = {} if lens is None else lens.model.coverage()
     photo_count = len(lens.profile.photos) if lens else 0

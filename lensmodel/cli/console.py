@@ -1,7 +1,6 @@
 """What all commands share: what they say, how they end, and their options.
 
-Results go to standard output, all else to standard error; progress is a bar on a terminal and plain lines
-elsewhere.
+Results go to standard output, all else to standard error, progress to terminals alone.
 """
 
 from __future__ import annotations
@@ -14,9 +13,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
 from datetime import timedelta
-from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Final
@@ -31,26 +28,21 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
 
 from lensmodel.core import types
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import to_json
 
-REMARKS = "lensmodel.remarks"  # Logs what was left out of a photo or replaced in it
 COMPILING = "lensmodel.correction.whole_photo.first_use"  # Logs when loops are compiled, once on a machine
-# At most one line in so many seconds (chosen): a night's log stays readable, and quick commands silent
-EVERY_S: Final = 10.0
 
 
 class _Lines(logging.Handler):
-    """Tells records as a command tells all else, above its bar; those for people in the same words, too."""
+    """Prints records as a command tells all else, above its bar."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print the line of a record."""
         try:
-            for_people = record.name in {REMARKS, COMPILING}
-            typer.echo(f"lensmodel: {record.getMessage()}" if for_people else self.format(record), err=True)
+            typer.echo(self.format(record), err=True)
         except Exception:  # noqa: BLE001 - as the handlers of the library do it
             self.handleError(record)
 
@@ -64,24 +56,15 @@ class Display:
 
     def __init__(self, *, quiet: bool = False, verbose: int = 0, as_json: bool = False) -> None:
         self.quiet, self.verbose, self.as_json = quiet, verbose, as_json
-        level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-        logging.basicConfig(
-            level=logging.ERROR if quiet else level,
-            format="%(levelname)s %(name)s: %(message)s",
-            handlers=[_Lines()],
-            force=True,
-        )
+        level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+        logging.basicConfig(level=level, format="lensmodel: %(message)s", handlers=[_Lines()], force=True)
         if not quiet and sys.stderr.isatty():  # so long a silence looks like a fault
             logging.getLogger(COMPILING).setLevel(logging.INFO)
 
-    def result(self, shown: str | Table) -> None:
-        """Print what was asked for, in words or as a table."""
-        if self.quiet or self.as_json:
-            return
-        if isinstance(shown, str):
-            typer.echo(shown)
-        else:
-            Console().print(shown)
+    def result(self, text: str) -> None:
+        """Print what was asked for, in words."""
+        if not (self.quiet or self.as_json):
+            typer.echo(text)
 
     def document(self, value: Any) -> None:  # noqa: ANN401 - any value that the codec knows
         """Print what was asked for as JSON, then the only thing on standard output."""
@@ -103,56 +86,30 @@ class Display:
         typer.echo(f"lensmodel: {text}", err=True)
 
     def progress(self, text: str = "", total: float | None = None) -> Bar:
-        """One bar with share and time left; plain lines now and then where no terminal can show it."""
-        terminal = sys.stderr.isatty()
-        return Bar(
-            text,
-            total,
-            say=None if self.quiet or terminal else partial(typer.echo, err=True),
+        """One bar with share and time left, on a terminal alone."""
+        bar = Bar(
+            TextColumn("{task.description}", markup=False),  # names of files may hold brackets
+            *(BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn()),
             console=Console(file=sys.stderr),
-            disable=self.quiet or not terminal,
+            disable=self.quiet or not sys.stderr.isatty(),
             transient=True,
             redirect_stdout=sys.stdout.isatty(),  # a pipe or file gets its results untouched
         )
+        bar.add_task(text, total=total)
+        return bar
 
 
 class Bar(Progress):
-    """The progress of one task, which never goes back; without a terminal, a plain line now and then."""
+    """The progress of one task."""
 
-    def __init__(
-        self,
-        text: str,
-        total: float | None,
-        *,
-        say: Callable[[str], None] | None = None,
-        every_s: float = EVERY_S,
-        **given: Any,  # noqa: ANN401 - as `Progress` takes them
-    ) -> None:
-        words = TextColumn("{task.description}", markup=False)  # names of files may hold brackets
-        super().__init__(
-            words, BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn(), **given
-        )
-        self._say, self._every_s, self._last = say, every_s, self.get_time()
-        self.add_task(text, total=total)
-        (self._task,) = self.tasks
+    def show(self, completed: float = 0.0, **changes: Any) -> None:  # noqa: ANN401 - as `Progress.update` takes them
+        """Change what is shown; what was done of a photo that is then passed over stays done."""
+        (task,) = self.tasks
+        self.update(task.id, completed=max(completed, task.completed), **changes)
 
-    def show(self, **changes: Any) -> None:  # noqa: ANN401 - as `Progress.update` takes them
-        """Change what is shown as `Progress.update` does; tell it if it is time.
-
-        What was done of a photo that is then passed over stays done.
-        """
-        task = self._task
-        if "completed" in changes:
-            changes["completed"] = max(changes["completed"], task.completed)
-        self.update(task.id, **changes)
-        if self._say is not None and self.get_time() - self._last >= self._every_s:
-            self._last = self.get_time()
-            done = f" {task.percentage:3.0f} %" if task.total else ""
-            self._say(f"[{clock(task.elapsed or 0.0)}]{done} {task.description or 'working'}")
-
-    def part(self, number: int, done: int, total: int, **changes: Any) -> None:  # noqa: ANN401 - as `show` takes them
+    def part(self, number: int, done: int, total: int, description: str | None = None) -> None:
         """Show that photo `number` is done as far as `done` of `total`."""
-        self.show(completed=number + done / max(total, 1), **changes)
+        self.show(number + done / max(total, 1), description=description)
 
 
 def clock(seconds: float) -> str:

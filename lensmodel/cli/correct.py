@@ -12,12 +12,9 @@ from datetime import datetime, timedelta
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import typer
-from rich import box
-from rich.table import Table
-from rich.text import Text
 
 import lensmodel
 from lensmodel.api import FORMATS, SEEN_DB
@@ -46,9 +43,6 @@ LEARN_FROM: Final = 8
 _UNSURE: Final = 0.5
 # Facts of a corrected photo that its result repeats
 _FOUND: Final = ("expected_gain_db", "zones", "nothing_to_correct", "audit", "chroma_step")
-_SAID: Final = 3  # photos of a group that are left for one reason and named (chosen); -v names all
-# Columns for the names of a group (chosen): with them the table fits a terminal of 80
-_LENS_WIDTH: Final = 26
 # Panels of the options that few people need
 LEARNING, CORRECTING = "Learning (--lens auto)", "Correcting"
 
@@ -123,7 +117,7 @@ def correct(
     Corrected photos are new files, NAME-corrected; the photos themselves are never changed. Files that
     are already there are left alone, so a run that was stopped can be started again and goes on from
     there. No file is ever half written. The names of the written files go to standard output; with
-    --lens auto it is a table instead, one row per lens, and -v reports on every photo.
+    --lens auto it is one line per lens instead, and -v reports on every photo.
 
     Examples:
 
@@ -131,11 +125,7 @@ def correct(
 
         lensmodel correct holiday --profile my-24mm.lensprofile -o corrected
 
-        lensmodel correct one.dng --profile my-24mm.lensprofile -o sharp.jpg --strength 0.7
-
-        lensmodel correct one.dng --profile my-24mm.lensprofile -o soft --halo 0.2 --denoise 0.5
-
-        lensmodel correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json
+        lensmodel correct one.dng --profile my-24mm.lensprofile -o sharp.jpg --strength 0.7 --halo 0.2
 
     Exit status: 0 done, 1 some photos failed, 2 wrong usage.
     """
@@ -208,8 +198,7 @@ class Correction:
     def photos(self, paths: Sequence[Path], lens: Lens | None) -> list[dict[str, Any]]:
         """Correct the photos of a lens, one after the other; return what became of each, and tell it."""
         results: list[dict[str, Any]] = []
-        left: Counter[str] = Counter()
-        display = self.display
+        display, reasons = self.display, set[str]()
         tell = display.detail if self.sorted else display.note
         with display.progress(total=len(paths)) as bar:
             for number, path in enumerate(paths):
@@ -219,10 +208,10 @@ class Correction:
                 match result["state"]:
                     case "failed":
                         display.error(f"{path}: {result['reason']}")
-                    case "left":
-                        left[result["reason"]] += 1
-                        several = left[result["reason"]] > _SAID
-                        (tell if several else display.note)(f"{path}: left as it is: {result['reason']}")
+                    case "left":  # of the photos of a lens, the first for each reason is named
+                        known = result["reason"] in reasons
+                        (tell if known else display.note)(f"{path}: left as it is: {result['reason']}")
+                        reasons.add(result["reason"])
                     case "kept":
                         tell(f"{target} is there already and was left alone; --force replaces it")
                     case _:
@@ -233,7 +222,7 @@ class Correction:
                         if result["nothing_to_correct"]:
                             tell(f"{path.name}: nothing to correct, its pixels stayed as they were")
                 results.append({"photo": str(path), "output": str(target), **result})
-                bar.show(completed=number + 1)
+                bar.show(number + 1)
         return results
 
     def _photo(self, path: Path, target: Path, lens: Lens | None, on_step: StepHook) -> dict[str, Any]:
@@ -255,8 +244,7 @@ class Correction:
             info = inspect(path)
             self._require_lens(path, info.metadata, lens)
             target.parent.mkdir(parents=True, exist_ok=True)
-            lossy = info.kind == "jpeg"
-            least = SEEN_DB if self.sorted or (lossy and not self.force) else None
+            least = SEEN_DB if self.sorted or (info.kind == "jpeg" and not self.force) else None
             corrected = lensmodel.correct(
                 path, lens, target, least_gain_db=least, on_step=on_step, **self.options
             )
@@ -265,35 +253,32 @@ class Correction:
         result = {"state": "corrected", **{name: getattr(corrected, name) for name in _FOUND}}
         if least is not None and corrected.expected_gain_db < least:
             insist = "" if self.sorted else "; --force corrects it all the same"
-            result |= {"state": "left", "reason": f"{_why_left(corrected, lossy=lossy)}{insist}"}
+            result |= {"state": "left", "reason": f"{_why_left(corrected)}{insist}"}
         return result
 
     def _require_lens(self, path: Path, said: PhotoMetadata, lens: Lens) -> None:
         """Refuse a photo of another lens, unless it is asked for; tell what the photo does not say."""
-        identity = Identity.of(said)
+        identity, note = Identity.of(said), self.display.note
         if why := difference(Identity.of_profile(lens.profile), identity):
             why = f"it seems to be of another lens: {why}"
             if not (self.any_lens or self.force):
                 raise InvalidInputError(f"{why}; use the profile of its own lens, or add --any-lens")
-            self.display.note(f"{path}: {why}; it is corrected all the same, as you asked")
+            note(f"{path}: {why}; it is corrected all the same, as you asked")
         elif not identity.names_lens and not self.sorted:  # else it was sorted by its camera
-            self.display.note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
+            note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
         if self.options["aperture"] is None and said.aperture is None:
-            self.display.note(
-                f"{path} does not say its aperture; all apertures of the profile are taken together"
-            )
+            note(f"{path} does not say its aperture; all apertures of the profile are taken together")
 
 
-def _why_left(corrected: lensmodel.Corrected, *, lossy: bool) -> str:
+def _why_left(corrected: lensmodel.Corrected) -> str:
     """Say in a sentence why a photo is not worth correcting."""
     zones = corrected.zones.values()
     error = sum(zone.cells * zone.psf_error for zone in zones) / max(sum(zone.cells for zone in zones), 1)
     why = (
         "not enough is known about its lens yet; take more photos that are full of detail"
         if error > _UNSURE
-        else "the camera has sharpened and compressed it, and no more can be restored safely"
-        if lossy
-        else "at this aperture the lens is about as sharp as its pixels, or the photo shows little detail"
+        else "at this aperture the lens is about as sharp as its pixels, the photo shows little detail, or "
+        "the camera has compressed it"
     )
     return f"a correction would gain too little to be seen (less than {SEEN_DB:g} dB): {why}"
 
@@ -306,8 +291,7 @@ BURST: Final = timedelta(seconds=2)
 MOST_IN_NAME: Final = 80
 
 
-@dataclass(frozen=True, slots=True)
-class Shot:
+class Shot(NamedTuple):
     """One photo and what its file says."""
 
     path: Path
@@ -326,9 +310,8 @@ class Shot:
         """What two photos of one copy of a lens agree in: its serial, or that of the body it was on."""
         said = self.metadata
         lens = (name_key(said.lens.model), serial_key(said.lens.serial))
-        if said.lens.serial:
-            return lens
-        return (*lens, name_key(said.camera_model), serial_key(said.body_serial))
+        body = () if said.lens.serial else (name_key(said.camera_model), serial_key(said.body_serial))
+        return lens + body
 
     @property
     def focal_mm(self) -> float:
@@ -348,7 +331,7 @@ class PhotoGroup:
 
     @property
     def words(self) -> dict[str, str]:
-        """Bodies, lens and focal length in words; its serial shortened, as tables are shown around."""
+        """Bodies, lens and focal length in words; its serial shortened, as people show them around."""
         said = [shot.metadata for shot in self.shots]
         cameras = (camera_name(one.camera_maker, one.camera_model) or "unknown camera" for one in said)
         lens, known = said[0].lens, [shot.focal_mm for shot in self.shots if shot.focal_mm]
@@ -359,15 +342,11 @@ class PhotoGroup:
             "focal_length": f"{'-'.join(ends)} mm" if known else "unknown focal length",
         }
 
-    @property
-    def scenes(self) -> int:
-        """How many different things the photos show: the frames of a burst are one."""
-        return len(self.shots) - len(self._repeated())
+    def to_learn_from(self) -> tuple[list[Path], int]:
+        """Return the photos in the order in which they tell most, and how many different things they show.
 
-    def to_learn_from(self) -> list[Path]:
-        """Return the photos in the order in which they tell most: each aperture's first one, then the second.
-
-        A photo whose aperture is unknown is the last of its turn; later frames of a burst come after all.
+        Each aperture's first one comes before any second, a photo whose aperture is unknown last in its turn;
+        later frames of a burst, which show the same, come after all.
         """
         repeated, turns = self._repeated(), Counter[tuple[bool, float]]()
         order = []
@@ -376,7 +355,7 @@ class PhotoGroup:
             again, aperture = shot.path in repeated, shot.metadata.aperture or math.inf
             order.append((again, turns[again, aperture], aperture, shot.path))
             turns[again, aperture] += 1
-        return [path for *_, path in sorted(order)]
+        return [path for *_, path in sorted(order)], len(order) - len(repeated)
 
     def _repeated(self) -> set[Path]:
         """Later frames of a burst: those that soon follow one at the same settings."""
@@ -402,14 +381,13 @@ def groups(shots: Iterable[Shot]) -> list[PhotoGroup]:
             continue
         names_lens = Identity.of(shot.metadata).names_lens
         if not (same and names_lens):
-            name = _name(shot, {taken for taken, _ in runs}, focal=not names_lens)
+            name = _name(shot.metadata, {taken for taken, _ in runs}, focal=not names_lens)
         runs.append((name, [shot]))
     return [PhotoGroup(tuple(sorted(run, key=lambda shot: shot.path)), name) for name, run in runs]
 
 
-def _name(shot: Shot, taken: Collection[str], *, focal: bool) -> str:
+def _name(said: PhotoMetadata, taken: Collection[str], *, focal: bool) -> str:
     """Name a profile; two copies whose serials end alike get a number."""
-    said = shot.metadata
     length = f"{said.focal_mm:g}mm" if said.focal_mm and focal else None
     words = [said.camera_model, said.lens.model, said.lens.serial and said.lens.serial[-4:], length]
     plain = re.sub(r"[^\w.+-]+", "-", "-".join(word for word in words if word)).strip("-.")
@@ -442,26 +420,29 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
         results += done
         states = Counter(result["state"] for result in done)
         gains = [result["expected_gain_db"] for result in done if result["state"] == "corrected"]
-        rows.append(
-            {
-                **group.words,
-                "profile": None if lens is None else str(profile),
-                "photos": len(done),
-                "learned_from": number,
-                "corrected": states["corrected"],
-                "corrected_before": states["kept"],
-                "left": states["left"],
-                "failed": states["failed"],
-                "expected_gain_db": sum(gains) / len(gains) if gains else None,  # of this run
-            }
+        gain = sum(gains) / len(gains) if gains else None
+        row = {
+            **group.words,
+            "profile": None if lens is None else str(profile),
+            "photos": len(done),
+            "learned_from": number,
+            "corrected": states["corrected"],
+            "corrected_before": states["kept"],
+            "left": states["left"],
+            "failed": states["failed"],
+            "expected_gain_db": gain,  # of this run
+        }
+        rows.append(row)
+        expected = f", expected gain {gain_words(gain)}" if gains else ""
+        display.result(
+            f"{', '.join(group.words.values())}: photos {len(done)}, learned from {number}, "
+            f"corrected {states['corrected'] + states['kept']}{expected}, "
+            f"left {states['left']}, failed {states['failed']}"
         )
-    if rows:
-        display.result(table_of(rows))
-    for row in rows:
-        if row["learned_from"] == 1:
+        if number == 1:
             display.note(
-                f"{row['camera']}, {row['lens']}: learned from one photo; with five or more its blur is "
-                "known better, and scenes do not pass for it"
+                "it was learned from one photo; with five or more its blur is known better, and scenes do not"
+                " pass for it"
             )
     if any(row["corrected"] for row in rows):
         where = ", ".join(sorted({str(target.parent) for target in correction.targets.values()}))
@@ -471,16 +452,16 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
 
 def _learn(group: PhotoGroup, profile: Path, most: int, correction: Correction) -> int:
     """Learn the lens of a group; return from how many photos, now or in an earlier run."""
-    display, counted, most = correction.display, 0, min(most, group.scenes)
+    display, counted = correction.display, 0
+    paths, scenes = group.to_learn_from()
+    most = min(most, scenes)
     store = files.ProfileFile(profile)
     config = configured(store.model, LensSettings(aperture=correction.options["aperture"]))
     calibration = Calibration(store, config, any_lens=correction.any_lens)
-    paths = group.to_learn_from()
     with display.progress("learning", total=most) as bar:
 
         def on_event(event: CalibrationEvent) -> None:
-            text = f"learning from {event.photo.name}: {event.stage}"
-            bar.part(counted, event.done, event.total, description=text)
+            bar.part(counted, event.done, event.total, f"learning from {event.photo.name}: {event.stage}")
 
         for event in calibration.learn(paths, on_event=on_event):
             if event.error is None:
@@ -492,23 +473,6 @@ def _learn(group: PhotoGroup, profile: Path, most: int, correction: Correction) 
                 break
     refused = [correction.refused.get(path) for path in paths]
     if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
-        reasons = set(map(str, refused))
-        why = f" ({reasons.pop()})" if len(reasons) == 1 else ""
         what = f"{group.words['lens']}, {group.words['focal_length']}"
-        display.note(f"{what}: no photo shows enough to learn its blur from{why}")
+        display.note(f"{what}: no photo shows enough to learn its blur from ({refused[0]})")
     return counted
-
-
-def table_of(rows: Iterable[Mapping[str, Any]]) -> Table:
-    """Return the table of groups, which fits a terminal of 80 columns."""
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("camera, lens, focal length", max_width=_LENS_WIDTH, overflow="fold")
-    for head in ("photos", "learned\nfrom", "corrected", "left", "failed", "expected\ngain"):
-        table.add_column(head, justify="right")
-    for row in rows:
-        gain = row["expected_gain_db"]
-        corrected = row["corrected"] + row["corrected_before"]
-        counts = row["photos"], row["learned_from"], corrected, row["left"], row["failed"]
-        names = ", ".join((row["camera"], row["lens"], row["focal_length"]))
-        table.add_row(Text(names), *map(str, counts), "" if gain is None else gain_words(gain))
-    return table

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,10 +16,6 @@ from lensmodel.lens import Lens
 from lensmodel.model import LensProfile, load_profile
 from lensmodel.photo.values import CORRECTED, ENDINGS, RAW_ENDINGS
 
-# Endings of pictures in folders that are told of where they are passed over (docs/formats.md)
-NOT_READ: Final = frozenset(
-    {".heic", ".heif", ".avif", ".webp", ".jxl", ".jp2", ".gif", ".bmp", ".psd", ".exr"}
-)
 # What phones add to the names of the files of one shot
 _PART_OF_SHOT: Final = re.compile(r"\.RAW-\d+(\.[A-Z]+)*$", re.IGNORECASE)
 
@@ -32,15 +28,20 @@ def photos(names: Iterable[Path], note: Callable[[str], None]) -> list[Path]:
     unique: dict[Path, None] = {}
     for path in names:
         if path.is_dir():
-            found, others = _originals(path), _passed_over(path)
+            inside = [
+                p for p in sorted(path.iterdir()) if p.name[0] != "." and not p.stem.endswith(CORRECTED)
+            ]
+            found = dict.fromkeys(p for p in inside if p.suffix.lower() in ENDINGS and p.is_file())
+            others = Counter("folder" if p.is_dir() else p.suffix.lower() for p in inside if p not in found)
+            passed_over = ", ".join(f"{kind or 'other'} {number}" for kind, number in others.items())
             if not found:
                 raise UsageError(
-                    f"no photo in the folder {path}; give one that holds RAW, TIFF, PNG or JPEG files"
-                    + (f" (passed over: {others})" if others else "")
+                    f"no photo in the folder {path}; give one that holds RAW, TIFF, PNG or JPEG files itself"
+                    + (f" (passed over: {passed_over})" if others else "")
                 )
             if others:
-                note(f"passed over: {others}")
-            unique.update(dict.fromkeys(found))
+                note(f"passed over in {path}: {passed_over}")
+            unique.update(found)
         elif path.is_file():
             unique[path] = None
         else:
@@ -49,29 +50,9 @@ def photos(names: Iterable[Path], note: Callable[[str], None]) -> list[Path]:
     return [p for p in unique if p.suffix.lower() in RAW_ENDINGS or _shot(p) not in raw]
 
 
-def _originals(folder: Path) -> list[Path]:
-    """Return the photos of a folder by name, without those that were corrected."""
-    photos = (p for p in folder.iterdir() if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
-    return sorted(p for p in photos if p.is_file() and not p.stem.endswith(CORRECTED))
-
-
-def _passed_over(folder: Path) -> str:
-    """Say which pictures of a folder are not taken for their kind, and which folders inside hold photos."""
-    inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    kinds = Counter(path.suffix[1:].upper() for path in inside if path.suffix.lower() in NOT_READ)
-    said = [f"{kind} files, which are not read: {count}" for kind, count in sorted(kinds.items())]
-    for path in inside:
-        with suppress(OSError):  # no folder, or one of the system's, as `lost+found` of a memory card
-            said += [f"the photos in {path}: name it too"] if _originals(path) else []
-    return "; ".join(said)
-
-
 def _shot(path: Path) -> tuple[Path, str]:
     """Name the shot of a file: IMG_1.DNG and img_1.jpg, x.RAW-02.ORIGINAL.dng and x.RAW-01.COVER.jpg."""
-    stem = path.stem
-    if Path(stem).suffix.lower() in RAW_ENDINGS:  # IMG_1.CR2.jpg
-        stem = Path(stem).stem
-    return path.parent, _PART_OF_SHOT.sub("", stem).casefold()
+    return path.parent, _PART_OF_SHOT.sub("", path.stem).casefold()
 
 
 def refuse_photo(target: Path, photos: Sequence[Path]) -> None:

@@ -80,7 +80,7 @@ def measure(
                 result = files.failed(error)
                 shown.error(f"{group[0]}: {result['reason']}")
             results.append({"photos": [str(path) for path in group], **result})
-            bar.show(completed=number + 1)
+            bar.show(number + 1)
             if result["state"] == "measured":
                 shown.result(
                     f"{profile}: {result['places']} places measured on {group[0].name} "

@@ -17,36 +17,21 @@ from running import SMALL, write_photo
 
 from lab.kernels import gaussian
 from lensmodel.cli import console
-from lensmodel.cli.console import Bar, Display
+from lensmodel.cli.console import Display
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 
 
-def test_without_a_terminal_progress_is_told_in_lines() -> None:
-    said: list[str] = []
-    with Bar("learning from a.dng", 4, say=said.append, every_s=0.0, disable=True) as bar:
-        bar.show(completed=1)
-    with Bar("quick work", 1, say=said.append, disable=True) as bar:
-        bar.show(completed=1)
-
-    assert said == ["[0:00:00]  25 % learning from a.dng"]
-
-
-def test_no_share_falls_where_a_photo_is_passed_over() -> None:
-    said: list[str] = []
-    now = [0.0]
-    bar = Bar("photos", 10, say=said.append, every_s=0.0, disable=True, get_time=lambda: now[0])
-    for at, done in ((60, 2), (70, 1), (80, 3)):
-        now[0] = at
-        bar.show(completed=done)
-
-    assert said == ["[0:01:00]  20 % photos", "[0:01:10]  20 % photos", "[0:01:20]  30 % photos"]
-
-
-def test_names_with_brackets_are_shown_whole() -> None:
+def test_names_with_brackets_are_shown_whole_and_no_share_falls_where_a_photo_is_passed_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     out = io.StringIO()
-    with Bar("correcting IMG[b].dng", 1, console=Console(file=out, force_terminal=True, width=100)):
-        pass
+    monkeypatch.setattr(console, "Console", lambda **_: Console(file=out, force_terminal=True, width=100))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with Display().progress("correcting IMG[b].dng", 10) as bar:
+        for done, share in ((2, 2), (1, 2), (3, 3)):
+            bar.show(done)
+            assert bar.tasks[0].completed == share
 
     assert "IMG[b].dng" in out.getvalue()
 
@@ -92,7 +77,7 @@ def test_that_loops_are_compiled_is_said_in_words_above_the_bar(
 def test_a_record_that_cannot_be_printed_ends_no_work(capsys: pytest.CaptureFixture[str]) -> None:
     Display()
     logging.getLogger("other").warning("%d photos", "no number")
-    logging.getLogger(console.REMARKS).warning("the next one")
+    logging.getLogger("lensmodel.remarks").warning("the next one")
     said = capsys.readouterr().err
     assert "Logging error" in said
     assert said.endswith("lensmodel: the next one\n")

@@ -29,8 +29,7 @@ from lensmodel.core.types import ZONES, FieldPosition, Frame, LensSettings, Plan
 from lensmodel.measured.edges import SlantedEdges
 from lensmodel.photo import develop
 from lensmodel.quality import edge_area, tangential_sagittal_mtf50
-from lensmodel.report import lens_report
-from lensmodel.report.lens_report import Range
+from lensmodel.report.lens_report import Range, lens_report
 from lensmodel.simulate import CameraLens, SimulatedCamera, photograph, write_photo
 
 MARGIN: Final = 40  # pixels of scene beyond the frame
@@ -170,10 +169,7 @@ def by_photos(lens: GridLens, photos: int, pitch_um: float) -> list[Sharpness]:
             known.shot(number, path)
         model = calibrate(shots, aperture=known.settings.aperture).model
     found = lens_report(model, "").tested[0]
-    return [
-        Sharpness(s.position, s.tangential, s.sagittal, (s.tangential_range, s.sagittal_range), s.unknown)
-        for s in found.map
-    ]
+    return [Sharpness(s.position, *s.mtf50, s.ranges, s.unknown) for s in found.map]
 
 
 def _line(lens: CameraLens, found: Sequence[Sharpness], pitch_um: float) -> str:

@@ -45,7 +45,7 @@ from lensmodel.patches import Patch
 from lensmodel.patches.select import Rejection
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.photo.metadata import find_location
-from lensmodel.report import lens_report
+from lensmodel.report.lens_report import lens_report
 
 log = logging.getLogger(__name__)
 

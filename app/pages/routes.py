@@ -34,7 +34,8 @@ from lensmodel.cli.console import gain_words
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import full_name
 from lensmodel.photo.values import ENDINGS
-from lensmodel.report import LensReport, Unit, caution, place_table, sharpness
+from lensmodel.report.export import place_table
+from lensmodel.report.lens_report import LensReport, Unit, caution, sharpness
 
 STATIC: Final = Path(__file__).parent / "static"
 HEADERS: Final = {

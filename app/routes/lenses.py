@@ -24,7 +24,8 @@ from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.files import from_json, to_json
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.model.profile import LensProfile, write_profile
-from lensmodel.report import LensReport, provenance, to_csv
+from lensmodel.report.export import to_csv
+from lensmodel.report.lens_report import LensReport, provenance
 
 router = APIRouter(tags=["lenses"], route_class=OneSession)
 

@@ -14,17 +14,8 @@ from lensmodel.cli.console import Display, UsageError
 from lensmodel.core.files import to_json, write_atomically
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.types import LensSettings
-from lensmodel.report import (
-    EXPORTERS,
-    LensReport,
-    compare,
-    filled_aspect,
-    lens_report,
-    provenance,
-    psf_grid,
-    to_csv,
-    widest,
-)
+from lensmodel.report.export import EXPORTERS, psf_grid, to_csv
+from lensmodel.report.lens_report import LensReport, compare, filled_aspect, lens_report, provenance, widest
 
 Aperture = Annotated[float | None, console.aperture("f-number; default: the widest that a photo had.")]
 

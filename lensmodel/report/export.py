@@ -13,7 +13,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import LensSettings
 from lensmodel.model import LensModel
 from lensmodel.report.centring import EDGE_R
-from lensmodel.report.lens_report import DEFAULT_ASPECT, UNIT_NAMES, ApertureReport, LensReport, Spot, grid
-
-_HEAD: Final = (
-    *("quantity", "aperture", "channel", "r", "phi", "row", "col", "frequency_c_px", "frequency_lp_mm"),
-    *("direction", "value", "low", "high", "unit", "predicted_error", "unknown"),
-)
-_Row: TypeAlias = dict[str, str | float | None]
-_MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the memory (chosen)
+from lensmodel.report.lens_report import DIRECTIONS, UNIT_NAMES, ApertureReport, LensReport, grid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,31 +39,15 @@ class PsfGrid:
 
 
 def psf_grid(
-    model: LensModel,
-    settings: LensSettings,
-    *,
-    rows: int = 5,
-    cols: int = 7,
-    size: int = 31,
-    aspect: float = DEFAULT_ASPECT,
+    model: LensModel, settings: LensSettings, *, rows: int, cols: int, size: int, aspect: float
 ) -> PsfGrid:
     """Ask a model for the kernels of a grid of places."""
-    if size < 1 or 4 * rows * cols * size * size > _MOST_BYTES:
-        raise InvalidInputError(
-            f"{rows} x {cols} kernels of side {size} are out of range; "
-            f"ask for at most {_MOST_BYTES >> 20} MiB"
-        )
     places = grid(rows, cols, aspect)
     answers = [model.query(place, settings, size) for place in places]
-    return PsfGrid(
-        kernels=np.array([answer.kernel for answer in answers], dtype=np.float32),
-        r=np.array([place.r for place in places]),
-        phi=np.array([place.phi for place in places]),
-        predicted_error=np.array([answer.predicted_error for answer in answers]),
-        rows=rows,
-        cols=cols,
-        settings=settings,
-    )
+    r, phi, error = np.array(
+        [(p.r, p.phi, a.predicted_error) for p, a in zip(places, answers, strict=True)]
+    ).T
+    return PsfGrid(np.array([a.kernel for a in answers], np.float32), r, phi, error, rows, cols, settings)
 
 
 def to_fits(psfs: PsfGrid) -> bytes:
@@ -89,15 +66,16 @@ def to_fits(psfs: PsfGrid) -> bytes:
         ) from error
     cube = psfs.kernels[:, ::-1, :]
     primary = fits.PrimaryHDU(np.ascontiguousarray(cube[0] if len(cube) == 1 else cube))
-    header = primary.header
-    header["ROWORDER"] = ("BOTTOM-UP", "first row stored is the bottom one")
-    header["GRIDROWS"], header["GRIDCOLS"] = psfs.rows, psfs.cols
-    header["FILTER"] = (psfs.settings.channel, "colour channel")
-    if psfs.settings.aperture is not None:
-        header["FNUMBER"] = (psfs.settings.aperture, "aperture, f-number")
-    if psfs.settings.focal_mm is not None:
-        header["FOCALLEN"] = (psfs.settings.focal_mm, "focal length, mm")
-    header["COMMENT"] = "point spread functions by lensmodel, sum 1"
+    for key, value, meaning in (
+        ("ROWORDER", "BOTTOM-UP", "first row stored is the bottom one"),
+        ("GRIDROWS", psfs.rows, "rows of the grid of places"),
+        ("GRIDCOLS", psfs.cols, "columns of the grid of places"),
+        ("FILTER", psfs.settings.channel, "colour channel"),
+        ("FNUMBER", psfs.settings.aperture, "aperture, f-number"),
+        ("COMMENT", "point spread functions by lensmodel, sum 1", ""),
+    ):
+        if value is not None:
+            primary.header[key] = (value, meaning)
     columns = [
         fits.Column("R", "D", unit="half-diagonal", array=psfs.r),
         fits.Column("PHI", "D", unit="rad", array=psfs.phi),
@@ -111,16 +89,17 @@ def to_fits(psfs: PsfGrid) -> bytes:
 def to_npz(psfs: PsfGrid) -> bytes:
     """NumPy archive with `psf` (n, k, k), `shape` (rows, cols), and r, phi, error of each place."""
     out = io.BytesIO()
-    aperture = math.nan if psfs.settings.aperture is None else psfs.settings.aperture
+    aperture = np.full(len(psfs.r), psfs.settings.aperture, dtype=np.float64)  # not a number where unknown
+    shape, channel = np.array([psfs.rows, psfs.cols]), np.array(psfs.settings.channel)
     np.savez_compressed(
         out,
         psf=psfs.kernels,
         r=psfs.r,
         phi=psfs.phi,
         error=psfs.predicted_error,
-        shape=np.array([psfs.rows, psfs.cols]),
-        aperture=np.full(len(psfs.r), aperture),
-        channel=np.array(psfs.settings.channel),
+        shape=shape,
+        aperture=aperture,
+        channel=channel,
     )
     return out.getvalue()
 
@@ -134,7 +113,6 @@ def to_json(psfs: PsfGrid) -> bytes:
     content = {
         "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
         "aperture": psfs.settings.aperture,
-        "focal_mm": psfs.settings.focal_mm,
         "channel": psfs.settings.channel,
         "rows": psfs.rows,
         "cols": psfs.cols,
@@ -149,58 +127,65 @@ EXPORTERS: Final[Mapping[str, Callable[[PsfGrid], bytes]]] = {"fits": to_fits, "
 
 def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
     """Return head and rows of tangential and sagittal MTF50 by aperture and place, in each known unit."""
-    words, units = report.sensor.words, report.sensor.units
+    units = report.sensor.units
     head = ["Aperture", "Place", *(f"{side}, {UNIT_NAMES[unit]}" for unit in units for side in "TS")]
     rows = []
     for found in report.tested:
-        for spot in (found.spots[0], *found.sides, *found.spots[1:]):
-            place = spot.place.removeprefix("the ") + (" (not known)" if spot.unknown else "")
-            figures = [words(value, unit, between) for unit in units for _, value, between in spot.directions]
+        for spot in found.spots:
+            figures = [words for unit in units for words in spot.figures(report.sensor, unit)]
+            place = spot.place + (" (not known)" if spot.unknown else "")
             rows.append([found.at or "unknown", place, *figures])
     return head, rows
+
+
+_COLUMNS: Final = (
+    *("quantity", "aperture", "r", "phi", "frequency_c_px", "direction"),
+    *("value", "low", "high", "unit", "predicted_error", "unknown"),
+)
 
 
 def to_csv(report: LensReport) -> str:
     """Write a report as CSV: MTF50 over the picture, contrast by radius, centring."""
     out = io.StringIO()
-    writer = csv.DictWriter(out, _HEAD, restval="", lineterminator="\n")
+    writer = csv.DictWriter(out, _COLUMNS, restval="", lineterminator="\n")
     writer.writeheader()
-    for row in (row for found in report.tested for row in _rows(found)):
-        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+    for found in report.tested:
+        for row in _rows(found):
+            own = {"aperture": found.settings.aperture, **row}
+            writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in own.items()})
     return out.getvalue()
 
 
-def _rows(found: ApertureReport) -> Iterator[_Row]:
+def _rows(found: ApertureReport) -> Iterator[dict[str, Any]]:
     """What was found at one aperture, as figures with what is known of each.
 
-    Centring is the verdict as 0 or 1, and both signs of a fault with two standard errors and their direction.
+    Centring is the verdict as 0 or 1, and by how much one side is softer, with two standard errors.
     """
-    known: _Row = {"aperture": found.settings.aperture, "channel": found.settings.channel}
     for zone, value in found.zones.items():
-        yield known | {"quantity": f"MTF50, mean of {zone}", "value": value, "unit": "c/px"}
-    cells = [(divmod(i, found.cols), spot) for i, spot in enumerate(found.map)]
-    spots: list[tuple[_Row, Spot]]
-    spots = [({"quantity": f"MTF50 at {s.place}"}, s) for s in (*found.spots, *found.sides)]
-    spots += [({"quantity": "MTF50", "row": row, "col": col}, s) for (row, col), s in cells]
-    for own, spot in spots:
-        own |= {"r": spot.position.r, "phi": spot.position.phi, "unit": "c/px", "unknown": int(spot.unknown)}
-        own |= {"predicted_error": spot.predicted_error}
-        for direction, value, (low, high) in spot.directions:
-            yield known | own | {"direction": direction, "value": value, "low": low, "high": high}
+        yield {"quantity": f"MTF50, mean of {zone}", "value": value, "unit": "c/px"}
+    for spot in (*found.spots, *found.map):
+        own = {
+            "quantity": f"MTF50 at the {spot.place}" if spot.place else "MTF50",
+            "r": spot.position.r,
+            "phi": spot.position.phi,
+            "unit": "c/px",
+            "predicted_error": spot.predicted_error,
+            "unknown": int(spot.unknown),
+        }
+        for direction, value, (low, high) in zip(DIRECTIONS, spot.mtf50, spot.ranges, strict=True):
+            yield own | {"direction": direction, "value": value, "low": low, "high": high}
     for curve in found.curves:
-        own = {"quantity": "MTF", "frequency_c_px": curve.frequency, "frequency_lp_mm": curve.lp_mm}
-        for direction, values in (("tangential", curve.tangential), ("sagittal", curve.sagittal)):
+        for direction, values in zip(DIRECTIONS, (curve.tangential, curve.sagittal), strict=True):
+            own = {"quantity": "MTF", "frequency_c_px": curve.frequency, "direction": direction}
             for r, value in zip(found.radii, values, strict=True):
-                yield known | own | {"direction": direction, "r": r, "value": value}
-    centring = found.centring
-    own = {"value": int(centring.verdict == "decentred"), "unknown": int(centring.verdict == "unknown")}
-    yield known | {"quantity": "decentred"} | own
-    for sign, quantity, unit, r in (
-        (centring.softer, "width of blur, softer side over opposite side", "ratio", EDGE_R),
-        (centring.coma, "coma in the middle of the picture", "cubed widths of blur", 0.0),
-    ):
-        if sign is not None:
-            ends = (sign.amount + k * sign.error for k in (0.0, -2.0, 2.0))
-            value, low, high = (math.exp(end) if unit == "ratio" else max(end, 0.0) for end in ends)
-            own = {"quantity": quantity, "unit": unit, "r": r, "phi": sign.direction}
-            yield known | own | {"value": value, "low": low, "high": high}
+                yield own | {"r": r, "value": value}
+    verdict, softer = found.centring.verdict, found.centring.softer
+    yield {
+        "quantity": "decentred",
+        "value": int(verdict == "decentred"),
+        "unknown": int(verdict == "unknown"),
+    }
+    if softer is not None:
+        value, low, high = (math.exp(softer.amount + k * softer.error) for k in (0.0, -2.0, 2.0))
+        own = {"quantity": "width of blur, softer side over opposite side", "unit": "ratio", "r": EDGE_R}
+        yield own | {"phi": softer.direction, "value": value, "low": low, "high": high}

@@ -18,18 +18,10 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
+from lensmodel.core import types
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import places_of
-from lensmodel.core.types import (
-    ZONES,
-    FieldPosition,
-    LensSettings,
-    StepHook,
-    Zone,
-    field_grid,
-    ignore_step,
-    zone_of,
-)
+from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Zone
 from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.neural import RING_MIDDLES
 from lensmodel.quality import crossing, mtf50_from_kernel, mtf_from_kernel
@@ -39,10 +31,11 @@ from lensmodel.report.centring import Centring, centring
 DEFAULT_ASPECT: Final = 1.5
 Unit = Literal["c/px", "lp/ph", "lp/mm"]
 UNIT_NAMES: Final[dict[Unit, str]] = {"c/px": "c/px", "lp/ph": "LP/PH", "lp/mm": "lp/mm"}
+DIRECTIONS: Final = ("tangential", "sagittal")
 # Cycles/pixel: beyond it a sensor shows no finer lines, and a measured MTF50 says only "at least"
 NYQUIST: Final = 0.5
-MOST_APERTURES: Final = 4  # a reader compares no more at once (chosen)
-ROWS: Final = 7  # of the grid of places: zones have some each, and their figures are still readable (chosen)
+_MOST_APERTURES: Final = 4  # a reader compares no more at once (chosen)
+_ROWS: Final = 7  # of the grid of places: zones have some each, and their figures are still readable (chosen)
 # Curves are drawn at one to four times such a step in lp/mm: 10 to 40, as lens tests are, and for sensors
 # with small pixels at the largest of which four lie below half of the Nyquist frequency (chosen)
 _STEPS_MM: Final = (50.0, 20.0, 10.0)
@@ -58,10 +51,14 @@ _FALLS: Final = ((_EVEN, "as sharp"), (0.8, "nearly as sharp"), (0.5, "clearly s
 # MTF50 in cycles/pixel of the centre, and what it is called (chosen: an ideal pixel behind an ideal lens
 # reaches .6, a demosaiced photo about .3)
 _LEVELS: Final = ((0.35, "very sharp"), (0.2, "sharp"), (0.1, "a little soft"), (0.0, "soft"))
+MARKED: Final = (
+    *("centre", "left", "right", "top", "bottom"),
+    *("upper left corner", "upper right corner", "lower left corner", "lower right corner"),
+)
 _ASPECTS: Final = (1.0, 4 / 3, 1.5, 16 / 9)
 _FILLED: Final = 0.85  # of the way to a side that samples reach at least (chosen: patches end short of it)
 
-CAUTION: Final = "Caution"  # name among the details of a report of what to allow for in its figures
+_CAUTION: Final = "Caution"  # name among the details of a report of what to allow for in its figures
 _NAMED: Final = 8  # photos that a report names (chosen: two lines)
 # Expected relative L2 of a kernel that another photo would not better by what is seen (chosen)
 _WELL_KNOWN: Final = 0.1
@@ -105,32 +102,22 @@ class SensorGeometry:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Contrast at one frequency over the radii of a report, mean over the ways to the four corners.
+    """Contrast at one frequency over `RADII`, mean over the ways to the four corners."""
 
-    `lp_mm` is the frequency in line pairs per millimetre, where the pixel pitch is known.
-    """
-
-    frequency: float
-    lp_mm: float | None
+    name: str  # the frequency in lp/mm where the pixel pitch is known, else in cycles/pixel
+    frequency: float  # cycles/pixel
     tangential: tuple[float, ...]
     sagittal: tuple[float, ...]
-
-    @property
-    def name(self) -> str:
-        """The frequency in words."""
-        return f"{self.frequency:.3g} c/px" if self.lp_mm is None else f"{self.lp_mm:.3g} lp/mm"
 
 
 @dataclass(frozen=True, slots=True)
 class Spot:
     """What the lens makes of a point at one place: MTF50, at most the Nyquist frequency, and the kernel."""
 
-    place: str  # as "the upper left corner"; empty on a map
+    place: str  # as "upper left corner"; empty on a map
     position: FieldPosition
-    tangential: float  # the Nyquist frequency means at least that
-    sagittal: float
-    tangential_range: Range
-    sagittal_range: Range
+    mtf50: tuple[float, float]  # tangential, sagittal; the Nyquist frequency means at least that
+    ranges: tuple[Range, Range]  # between what these are expected
     predicted_error: float  # expected relative L2 of the kernel
     unknown: bool  # whether too little is known of the place to call this the lens
     kernel: tuple[tuple[float, ...], ...] = ()  # its rows, left out of the places of a map
@@ -138,30 +125,22 @@ class Spot:
     @property
     def mean(self) -> float:
         """Mean of both MTF50."""
-        return (self.tangential + self.sagittal) / 2.0
+        return sum(self.mtf50) / 2.0
 
     @property
     def mean_range(self) -> Range:
         """Between what the mean is expected."""
-        (t_low, t_high), (s_low, s_high) = self.tangential_range, self.sagittal_range
-        return (t_low + s_low) / 2.0, (t_high + s_high) / 2.0
-
-    @property
-    def side(self) -> str:
-        """The place without its article and the word corner: "upper left"."""
-        return self.place.removeprefix("the ").removesuffix(" corner")
-
-    @property
-    def directions(self) -> tuple[tuple[str, float, Range], ...]:
-        """Both directions with figure and range."""
-        tangential = "tangential", self.tangential, self.tangential_range
-        return tangential, ("sagittal", self.sagittal, self.sagittal_range)
+        low, high = np.mean(self.ranges, axis=0).tolist()
+        return low, high
 
     @property
     def words(self) -> str:
         """Both figures with their ranges, never one of the two."""
-        figures = [SensorGeometry().words(value, between=between) for _, value, between in self.directions]
-        return "T {}, S {}".format(*figures)
+        return "T {}, S {}".format(*self.figures(SensorGeometry()))
+
+    def figures(self, sensor: SensorGeometry, unit: Unit = "c/px") -> list[str]:
+        """Both figures with their ranges, in a unit."""
+        return [sensor.words(*figure) for figure in zip(self.mtf50, (unit, unit), self.ranges, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +152,15 @@ class ApertureReport:
     rows: int
     cols: int
     map: tuple[Spot, ...]  # row by row from the top left, without kernels
+    spots: tuple[Spot, ...]  # of `marked_places`: the centre, the four sides, the four corners
     radii: tuple[float, ...]
     curves: tuple[Curve, ...]
-    spots: tuple[Spot, ...]  # the centre and the four corners
-    sides: tuple[Spot, ...]  # left, right, top and bottom, at four fifths of the way to the edge
     centring: Centring
+
+    @property
+    def corners(self) -> tuple[Spot, ...]:
+        """The four corners."""
+        return self.spots[5:]
 
     @property
     def unknown_share(self) -> float:
@@ -187,13 +170,13 @@ class ApertureReport:
     @property
     def zones(self) -> dict[Zone, float]:
         """Mean MTF50 of the map's places in each zone, cycles/pixel; not a number where it has none."""
-        own = {zone: [s.mean for s in self.map if zone_of(s.position.r) == zone] for zone in ZONES}
+        own = {zone: [s.mean for s in self.map if types.zone_of(s.position.r) == zone] for zone in ZONES}
         return {zone: float(np.mean(means)) if means else math.nan for zone, means in own.items()}
 
     @property
     def worst(self) -> Spot:
         """The softest corner."""
-        return min(self.spots[1:], key=lambda spot: spot.mean)
+        return min(self.corners, key=lambda spot: spot.mean)
 
     @property
     def at(self) -> str:
@@ -240,26 +223,23 @@ class LensReport:
                 "Nothing is known beyond the outermost places that were measured: what you photograph to "
                 "measure, let it fill the frame."
             )
-        spots = [(spot, one) for one in self.tested for spot in (*one.spots, *one.sides)]
+        spots = [(spot, one) for one in self.tested for spot in one.spots]
         least, tested = max(spots, key=lambda pair: pair[0].predicted_error)
         if least.predicted_error < _WELL_KNOWN:
             return "The lens is well known by now; another photo would add little."
         at = f", taken at {tested.at}," if tested.at else ""
         return (
-            f"A photo with fine detail at {least.place}{at} would help most: what is known of the blur there "
-            f"is expected to be wrong by {least.predicted_error:.0%}, more than elsewhere."
+            f"A photo with fine detail at the {least.place}{at} would help most: what is known of the blur "
+            f"there is expected to be wrong by {least.predicted_error:.0%}, more than elsewhere."
         )
 
     @property
     def summary(self) -> tuple[str, ...]:
         """The report in sentences, those of its first aperture."""
-        first = self.tested[0]
-        lines = [self.verdict]
-        if first.unknown_share:
-            lines.append(
-                f"Too little is known of {first.unknown_share:.0%} of the picture; those figures are guesses."
-            )
-        return (*lines, *filter(None, [self.details.get(CAUTION)]), self.advice)
+        share = self.tested[0].unknown_share
+        guesses = f"Too little is known of {share:.0%} of the picture; those figures are guesses."
+        lines = (self.verdict, guesses if share else "", self.details.get(_CAUTION, ""), self.advice)
+        return tuple(filter(None, lines))
 
 
 def _counted(number: int, what: str) -> str:
@@ -269,10 +249,8 @@ def _counted(number: int, what: str) -> str:
 def caution(photos: Sequence[str]) -> str:
     """Say of the file names of photos that cameras have sharpened some; nothing where none is a JPEG."""
     jpegs = sum(name.lower().endswith((".jpg", ".jpeg")) for name in photos)
-    share = "" if jpegs == len(photos) else f" ({jpegs} of {len(photos)} photos)"
-    return (
-        f"Learned from JPEG files{share}: the camera's sharpening makes a lens look sharper." if jpegs else ""
-    )
+    share = f"Learned from JPEG files ({jpegs} of {len(photos)} photos)"
+    return f"{share}: the camera's sharpening makes a lens look sharper." if jpegs else ""
 
 
 def provenance(serial: str | None, cameras: Iterable[str], photos: Sequence[str]) -> dict[str, str]:
@@ -283,7 +261,7 @@ def provenance(serial: str | None, cameras: Iterable[str], photos: Sequence[str]
         "Serial number": serial or "",
         "Camera": ", ".join(dict.fromkeys(filter(None, cameras))),
         "Photos": ", ".join(names[:_NAMED]) + more,
-        CAUTION: caution(names),
+        _CAUTION: caution(names),
         "Written": f"{datetime.now(UTC):%Y-%m-%d} by lensmodel {version('lensmodel')}",
     }
     return {name: words for name, words in details.items() if words}
@@ -296,10 +274,10 @@ def lens_report(
     aspect: float | None = None,
     height_px: int | None = None,
     apertures: Sequence[float] | None = None,
-    rows: int = ROWS,
+    rows: int = _ROWS,
     size: int = 31,
     details: Mapping[str, str] | None = None,
-    on_step: StepHook = ignore_step,
+    on_step: types.StepHook = types.ignore_step,
 ) -> LensReport:
     """Report on a lens at the apertures of its photos, or at those that are given.
 
@@ -309,31 +287,30 @@ def lens_report(
     """
     aspect = filled_aspect(model) if aspect is None else aspect
     cols = max(3, round(rows * aspect))
-    named = marked_places(aspect).items()
-    mapped = [("", at) for at in grid(rows, cols, aspect)]
+    places = [*marked_places(aspect).items(), *(("", at) for at in grid(rows, cols, aspect))]
     numbers = _chosen(model) if apertures is None else apertures
     questions = [LensSettings(aperture=n) for n in numbers] or [LensSettings()]
-    pitch = _shared(sample.pixel_pitch_um for sample in model.samples)
-    frequencies = _frequencies(pitch)
+    pitch, half = (
+        _shared(getattr(s, n) for s in model.samples) for n in ("pixel_pitch_um", "half_diagonal_px")
+    )
+    measured = all(sample.measured for sample in model.samples)
     tested = []
     for settings in questions:
-        spots = _spots(model, settings, [*mapped, *named], size)
+        spots = _spots(model, settings, places, size, measured)
         tested.append(
             ApertureReport(
                 settings=settings,
                 aspect=aspect,
                 rows=rows,
                 cols=cols,
-                map=tuple(replace(spot, kernel=()) for spot in spots[: len(mapped)]),
+                map=tuple(replace(spot, kernel=()) for spot in spots[9:]),
+                spots=tuple(spots[:9]),
                 radii=RADII,
-                curves=_curves(model, settings, aspect, size, frequencies),
-                spots=tuple(spots[len(mapped) : -4]),
-                sides=tuple(spots[-4:]),
+                curves=_curves(model, settings, aspect, size, _frequencies(pitch)),
                 centring=centring(model, settings),
             )
         )
         on_step(len(tested), len(questions))
-    half = _shared(sample.half_diagonal_px for sample in model.samples)
     if height_px is None and half is not None:
         height_px = round(2.0 * half * min(half_sides(aspect)))
     return LensReport(
@@ -344,35 +321,35 @@ def lens_report(
         sensor=SensorGeometry(pitch, height_px),
         tested=tuple(tested),
         details=dict(details or {}),
-        measured=_measured(model),
+        measured=measured,
     )
 
 
-def _measured(model: LensModel) -> bool:
-    return all(sample.measured for sample in model.samples)
-
-
 def _spots(
-    model: LensModel, settings: LensSettings, named: Sequence[tuple[str, FieldPosition]], size: int
+    model: LensModel,
+    settings: LensSettings,
+    places: Sequence[tuple[str, FieldPosition]],
+    size: int,
+    measured: bool,
 ) -> list[Spot]:
     """What a model knows of named places.
 
     Beyond the outermost samples of a chart or a target the regression extrapolates: corners there came out
     softer by 38 to 47 %.
     """
-    measured, outside = _measured(model), np.zeros(len(named), dtype=np.bool_)
+    outside = np.zeros(len(places), dtype=np.bool_)
     if not model.weights:
         with suppress(QhullError):  # too few samples, or all on a line
             hull = Delaunay([_ROUND * np.array(sample.position.xy) for sample in model.samples])
-            outside = hull.find_simplex([at.xy for _, at in named]) < 0
+            outside = hull.find_simplex([at.xy for _, at in places]) < 0
     spots = []
-    for (words, at), beyond in zip(named, outside, strict=True):
+    for (words, at), beyond in zip(places, outside, strict=True):
         answer = model.query(at, settings, size)
         error = float(answer.predicted_error)
-        (t, t_range), (s, s_range) = (_mtf50(answer, at.phi + turn, measured) for turn in _TURNS)
+        mtf50, ranges = zip(*(_mtf50(answer, at.phi + turn, measured) for turn in _TURNS), strict=True)
         unknown = bool(answer.extrapolated or beyond or not (measured or error < UNKNOWN))
         kernel = tuple(tuple(row) for row in answer.kernel.round(7).tolist())
-        spots.append(Spot(words, at, t, s, t_range, s_range, error, unknown, kernel))
+        spots.append(Spot(words, at, mtf50, ranges, error, unknown, kernel))
     return spots
 
 
@@ -394,25 +371,27 @@ def _mtf50(answer: PsfAnswer, angle: float, measured: bool) -> tuple[float, Rang
 
 
 def _curves(
-    model: LensModel,
-    settings: LensSettings,
-    aspect: float,
-    size: int,
-    wanted: Sequence[tuple[float, float | None]],
+    model: LensModel, settings: LensSettings, aspect: float, size: int, named: Mapping[str, float]
 ) -> tuple[Curve, ...]:
-    """Contrast at wanted frequencies from the centre to the corners, mean of the four."""
-    frequencies = [f for f, _ in wanted]
+    """Contrast at named frequencies from the centre to the corners, mean of the four."""
     places = [FieldPosition(r, phi) for r in RADII for phi in corner_angles(aspect)]
     contrasts = [
-        [mtf_from_kernel(kernel, at.phi + turn, frequencies) for turn in _TURNS]
+        [mtf_from_kernel(kernel, at.phi + turn, list(named.values())) for turn in _TURNS]
         for kernel, at in zip(model.kernels(places, settings, size), places, strict=True)
     ]
-    mean = np.reshape(contrasts, (len(RADII), 4, 2, len(wanted))).mean(axis=1)
+    mean = np.reshape(contrasts, (len(RADII), 4, 2, len(named))).mean(axis=1)
     mean[0] = mean[0].mean(axis=0)  # u has no direction in the centre
-    return tuple(
-        Curve(f, lp, *map(tuple, both))
-        for (f, lp), both in zip(wanted, mean.transpose(2, 1, 0).tolist(), strict=True)
-    )
+    both = mean.transpose(2, 1, 0).tolist()
+    return tuple(Curve(*of, *map(tuple, t_s)) for of, t_s in zip(named.items(), both, strict=True))
+
+
+def _frequencies(pitch_um: float | None) -> dict[str, float]:
+    """Names and cycles/pixel of the curves, only those up to the Nyquist frequency of the sensor."""
+    if pitch_um is None:
+        return {f"{f:.3g} c/px": f for f in _FREQUENCIES}
+    step = next((step for step in _STEPS_MM if 8.0 * step <= 500.0 / pitch_um), _STEPS_MM[-1])
+    named = {f"{k * step:.3g} lp/mm": k * step * pitch_um / 1000.0 for k in range(1, 5)}
+    return {name: f for name, f in named.items() if f <= NYQUIST}
 
 
 def _verdict(tested: Sequence[ApertureReport]) -> str:
@@ -438,23 +417,41 @@ def sharpness(found: ApertureReport) -> str:
     how = next(words for least, words in _FALLS if share >= least)
     # surely softer only where even the top of its range lies below the middle of the centre's
     sure = not worst.unknown and (share >= _EVEN or worst.mean_range[1] < center)
-    fall = f"its worst corner, the {worst.side}, {'is' if sure else 'seems'} {how} ({worst.words})"
+    corner = worst.place.removesuffix(" corner")
+    fall = f"its worst corner, the {corner}, {'is' if sure else 'seems'} {how} ({worst.words})"
     unknown = ", but too little is known there" if worst.unknown else ""
     begin = f"At {found.at} {words}" if found.at else f"{words[0].upper()}{words[1:]}"
     return f"{begin}, and {fall}{unknown}."
 
 
+def compare(first: LensReport, second: LensReport) -> str:
+    """Say in which zones the second copy is sharper or softer, each at the first aperture of its report."""
+    changes = []
+    for zone, where in zip(ZONES, ("in the centre", "halfway out", "in the corners"), strict=True):
+        share = second.tested[0].zones[zone] / first.tested[0].zones[zone] - 1.0
+        how = f"{abs(share):.0%} {'sharper' if share > 0 else 'softer'}"
+        changes.append(f"{'about the same' if abs(share) < 1.0 - _EVEN else how} {where}")
+    begin = f"Compared with this copy, the other one ({second.name}) is"
+    return f"{begin} {', '.join(changes[:-1])} and {changes[-1]}."
+
+
+# --- what the samples of a lens tell of its photos -----------------------------------------------
+
+
 def widest(model: LensModel) -> LensSettings:
     """The widest aperture that a photo had, green; focal length and distance as unknown."""
-    known = [s.settings.aperture for s in model.samples if s.settings.aperture is not None]
-    return LensSettings(aperture=min(known, default=None))
+    return LensSettings(aperture=min(_apertures(model), default=None))
+
+
+def _apertures(model: LensModel) -> list[float]:
+    return [s.settings.aperture for s in model.samples if s.settings.aperture is not None]
 
 
 def _chosen(model: LensModel) -> list[float]:
     """Apertures to test: all, or where there are many the ends and those between with most samples."""
-    numbers = [s.settings.aperture for s in model.samples if s.settings.aperture is not None]
+    numbers = _apertures(model)
     known = sorted(set(numbers))
-    inner = sorted(known[1:-1], key=lambda n: -numbers.count(n))[: MOST_APERTURES - 2]
+    inner = sorted(known[1:-1], key=lambda n: -numbers.count(n))[: _MOST_APERTURES - 2]
     return sorted({*known[:1], *known[-1:], *inner})
 
 
@@ -469,33 +466,9 @@ def filled_aspect(model: LensModel) -> float:
     A chart has a shape of its own, and says nothing of the frame's.
     """
     places = [s.position.xy for s in model.samples if not s.measured] or [(0.0, 0.0)]
-    reached = np.abs(places).max(axis=0)
-    shares = {aspect: reached / half_sides(aspect) for aspect in _ASPECTS}
-    inside = {
-        aspect: share for aspect, share in shares.items() if share.max() <= 1.0 and share.min() > _FILLED
-    }
-    return min(inside, key=lambda a: abs(float(np.diff(inside[a])[0])), default=DEFAULT_ASPECT)
-
-
-def _frequencies(pitch_um: float | None) -> list[tuple[float, float | None]]:
-    """Cycles/pixel and lp/mm of the curves, only those up to the Nyquist frequency of the sensor."""
-    if pitch_um is None:
-        return [(f, None) for f in _FREQUENCIES]
-    nyquist = 500.0 / pitch_um
-    step = next((step for step in _STEPS_MM if 4.0 * step <= nyquist / 2.0), _STEPS_MM[-1])
-    pairs = [(k * step * pitch_um / 1000.0, k * step) for k in range(1, 5)]
-    return [(f, lp) for f, lp in pairs if f <= NYQUIST]
-
-
-def compare(first: LensReport, second: LensReport) -> str:
-    """Say in which zones the second copy is sharper or softer, each at the first aperture of its report."""
-    changes = []
-    for zone, where in zip(ZONES, ("in the centre", "halfway out", "in the corners"), strict=True):
-        share = second.tested[0].zones[zone] / first.tested[0].zones[zone] - 1.0
-        how = f"{abs(share):.0%} {'sharper' if share > 0 else 'softer'}"
-        changes.append(f"{'about the same' if abs(share) < 1.0 - _EVEN else how} {where}")
-    begin = f"Compared with this copy, the other one ({second.name}) is"
-    return f"{begin} {', '.join(changes[:-1])} and {changes[-1]}."
+    shares = {aspect: np.abs(places).max(axis=0) / half_sides(aspect) for aspect in _ASPECTS}
+    inside = [a for a, share in shares.items() if share.max() <= 1.0 and share.min() > _FILLED]
+    return min(inside, key=lambda a: float(np.ptp(shares[a])), default=DEFAULT_ASPECT)
 
 
 # --- places of the field -------------------------------------------------------------------------
@@ -511,8 +484,8 @@ def half_sides(aspect: float) -> tuple[float, float]:
 
 def grid(rows: int, cols: int, aspect: float) -> tuple[FieldPosition, ...]:
     """Centres of rows x cols equal cells of the picture, row by row from the top left."""
-    places = np.stack(field_grid(rows, cols, aspect=aspect), axis=2).reshape(-1, 2)
-    return tuple(FieldPosition(r, phi) for r, phi in places.tolist())
+    r, phi = types.field_grid(rows, cols, aspect=aspect)
+    return tuple(map(FieldPosition, r.ravel().tolist(), phi.ravel().tolist()))
 
 
 def corner_angles(aspect: float) -> tuple[float, float, float, float]:
@@ -522,16 +495,8 @@ def corner_angles(aspect: float) -> tuple[float, float, float, float]:
 
 
 def marked_places(aspect: float) -> dict[str, FieldPosition]:
-    """The centre, the corners as far out as samples reach, and the sides at four fifths, by their names."""
+    """The centre, the sides at four fifths, and the corners as far out as samples reach, by their names."""
     width, height = (0.8 * half for half in half_sides(aspect))
-    corners = zip(
-        ("upper left", "upper right", "lower left", "lower right"), corner_angles(aspect), strict=True
-    )
-    return {
-        "the centre": FieldPosition(0.0, 0.0),
-        **{f"the {side} corner": FieldPosition(0.9, phi) for side, phi in corners},
-        "the left": FieldPosition(width, math.pi),
-        "the right": FieldPosition(width, 0.0),
-        "the top": FieldPosition(height, math.pi / 2.0),
-        "the bottom": FieldPosition(height, -math.pi / 2.0),
-    }
+    sides = (width, math.pi), (width, 0.0), (height, math.pi / 2.0), (height, -math.pi / 2.0)
+    places = ((0.0, 0.0), *sides, *((0.9, angle) for angle in corner_angles(aspect)))
+    return {name: FieldPosition(*place) for name, place in zip(MARKED, places, strict=True)}

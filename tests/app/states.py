@@ -14,7 +14,7 @@ from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from lensmodel.core.files import to_json
 from lensmodel.model import LensModel
-from lensmodel.report import lens_report
+from lensmodel.report.lens_report import lens_report
 
 Steps = Any  # the fixture `steps` of conftest.py
 TIFF = b"II*\x00" + bytes(9000)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from functools import partial
 
 from app.jobs import tasks
-from lensmodel.report import lens_report
+from lensmodel.report.lens_report import lens_report
 
 tasks.lens_report = partial(lens_report, rows=5, size=15)  # instead of 7 and 31
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, Literal, TypeAlias, cast
+from typing import Final, Literal, TypeAlias
 
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.photo.values import Matrix3, Transfer
+from lensmodel.photo.values import Transfer
 
 CODES: Final = 65536  # of 16 bits
 _LEAST_COLUMN: Final = 1e-3  # of XYZ: a channel that gives no light has no curve
@@ -43,13 +43,11 @@ def srgb_to_linear(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=8)
 def curves_of(transfer: Transfer, icc: bytes | None = None) -> tuple[Curve, Curve, Curve]:
-    """Curves of r, g and b. A profile without curves of its own is read as sRGB."""
+    """Curves of r, g and b; of a profile that cannot be read those of sRGB."""
     codes = np.linspace(0.0, 1.0, CODES)
-    if transfer == "linear":
-        return (codes.astype(np.float32),) * 3
-    if transfer == "icc" and icc is not None and (profile := matrix_profile(icc)) is not None:
+    if transfer == "icc" and (profile := read_profile(icc)) is not None:
         return profile.curves
-    return (srgb_to_linear(codes).astype(np.float32),) * 3
+    return ((codes if transfer == "linear" else srgb_to_linear(codes)).astype(np.float32),) * 3
 
 
 def decode(codes: NDArray[np.generic], curve: Curve) -> NDArray[np.float32]:
@@ -83,111 +81,71 @@ def encode(linear: NDArray[np.float32], table: NDArray[np.float32]) -> NDArray[n
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MatrixProfile:
-    """What a profile of RGB or grey says by three curves and a matrix."""
+class Profile:
+    """What a profile of RGB or grey says of light."""
 
-    curves: tuple[Curve, Curve, Curve]
-    to_xyz: Matrix  # (3, 3), linear RGB to XYZ under D50
-
-
-def icc_space(icc: bytes) -> str:
-    """Colour space of a profile: "RGB", "GRAY", "CMYK", ..."""
-    return icc[16:20].decode("latin-1").strip()
-
-
-def is_whole(icc: bytes) -> bool:
-    """Whether a profile has all the bytes that it says to have: ICC.1:2022, section 7.2.2."""
-    return 128 <= int.from_bytes(icc[:4], "big") <= len(icc) + 3  # the last tag is often not padded
+    curves: tuple[Curve, Curve, Curve]  # those of sRGB where the profile is made of tables
+    to_xyz: Matrix | None  # (3, 3), linear RGB to XYZ under D50; None where channels do not just add up
 
 
 @lru_cache(maxsize=8)
-def is_of_rgb(icc: bytes) -> bool:
-    """Whether a profile, perhaps one of tables, says what light numbers of RGB stand for."""
-    try:
-        return is_whole(icc) and icc_space(icc) == "RGB" and len(_to_xyz(np.eye(3), icc, "rgb")) == 3
-    except (imagecodecs.CmsError, ValueError):
-        return False
-
-
-@lru_cache(maxsize=8)
-def matrix_profile(icc: bytes) -> MatrixProfile | None:
-    """Ask LittleCMS for the XYZ of each channel's levels alone; None where the channels do not just add up.
-
-    So it is with profiles of printers and those made of tables, and with nonsense.
-    """
-    space = {"RGB": "rgb", "GRAY": "gray"}.get(icc_space(icc))
-    if space is None or not is_whole(icc):
+def read_profile(icc: bytes | None) -> Profile | None:
+    """Ask LittleCMS for the XYZ of each channel's levels alone; None for nonsense, and colours of prints."""
+    space = {b"RGB ": "rgb", b"GRAY": "gray"}.get((icc or b"")[16:20])
+    # ICC.1:2022, section 7.2.2; the last tag is often not padded
+    if icc is None or space is None or not 128 <= int.from_bytes(icc[:4], "big") <= len(icc) + 3:
         return None
     codes = np.linspace(0.0, 1.0, CODES)
     channels = 3 if space == "rgb" else 1
     mixed = np.random.default_rng(0).random((64, channels))
-    ramps = np.zeros((channels, CODES, channels))
-    for k in range(channels):
-        ramps[k, :, k] = codes
-    try:
-        xyz = _to_xyz(np.concatenate([ramps.reshape(-1, channels), mixed]), icc, space)
+    ramps = np.einsum("n,kc->knc", codes, np.eye(channels)).reshape(-1, channels)
+    try:  # relative colorimetric: white is that of D50
+        found = imagecodecs.cms_transform(
+            np.concatenate([ramps, mixed])[None],
+            icc,
+            imagecodecs.cms_profile("xyz"),
+            colorspace=space,
+            outcolorspace="xyz",
+            outdtype=np.float64,
+            intent=1,
+        )[0]
     except (imagecodecs.CmsError, ValueError):
         return None
-    xyz, of_mixed = xyz[:-64].reshape(channels, CODES, 3), xyz[-64:]
+    xyz, of_mixed = found[:-64].reshape(channels, CODES, 3), found[-64:]
     columns = xyz[:, -1, :].T  # of the full channels
     power = (columns**2).sum(axis=0)
-    if not np.isfinite(xyz).all() or power.min() < _LEAST_COLUMN**2:
-        return None
-    levels = np.einsum("knx,xk->kn", xyz, columns) / power[:, None]
+    levels = np.einsum("knx,xk->kn", xyz, columns) / np.maximum(power, _LEAST_COLUMN**2)[:, None]
     levels = np.maximum.accumulate(np.clip(levels, 0.0, 1.0), axis=1)
     at = np.stack([np.interp(mixed[:, k], codes, levels[k]) for k in range(channels)], axis=-1)
-    if np.abs(at @ columns.T - of_mixed).max() > _ADDITIVE:
-        return None
-    red, green, blue = np.broadcast_to(levels, (3, CODES)).astype(np.float32)
     to_xyz = columns if channels == 3 else D65_TO_D50 @ SRGB_TO_XYZ_D65
-    return MatrixProfile((red, green, blue), to_xyz) if abs(np.linalg.det(to_xyz)) > 1e-6 else None
+    additive = np.abs(at @ columns.T - of_mixed).max() <= _ADDITIVE
+    if not additive or power.min() < _LEAST_COLUMN**2 or abs(np.linalg.det(to_xyz)) < 1e-6:
+        return Profile(curves_of("srgb"), None) if channels == 3 else None
+    red, green, blue = np.broadcast_to(levels, (3, CODES)).astype(np.float32)
+    return Profile((red, green, blue), to_xyz)
 
 
-def _to_xyz(values: NDArray[np.float64], icc: bytes, space: str) -> NDArray[np.float64]:
-    """XYZ under D50 of numbers `(value, channel)`, relative colorimetric: white is that of D50."""
-    out = imagecodecs.cms_transform(
-        values[None],
-        icc,
-        imagecodecs.cms_profile("xyz"),
-        colorspace=space,
-        outcolorspace="xyz",
-        outdtype=np.float64,
-        intent=1,
-    )
-    return np.asarray(out, dtype=np.float64).reshape(-1, 3)
+def named_profile(name: Literal["srgb", "adobergb"]) -> bytes:
+    """Return the profile of a colour space."""
+    return _dated(imagecodecs.cms_profile(name))
 
 
-def linear_profile(to_xyz_d50: Matrix, name: str) -> bytes:
-    """Make an ICC profile, version 2, of linear RGB with the given primaries."""
-
-    def xyz(vector: NDArray[np.float64]) -> bytes:
-        return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(float(v) * 65536) for v in vector))
-
-    text = name.encode("ascii")
-    description = b"desc\0\0\0\0" + struct.pack(">I", len(text) + 1) + text + b"\0" + bytes(78)
-    linear = b"curv\0\0\0\0" + struct.pack(">I", 0)
-    tags = {
-        b"desc": description,
-        b"cprt": b"text\0\0\0\0No copyright, use freely\0",
-        b"wtpt": xyz(np.array([0.9642, 1.0, 0.8249])),
-        **{name_: xyz(to_xyz_d50[:, k]) for k, name_ in enumerate((b"rXYZ", b"gXYZ", b"bXYZ"))},
-        **dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), linear),
-    }
-    table, body, at = b"", b"", 132 + 12 * len(tags)
-    for tag, data in tags.items():
-        padded = data + bytes(-len(data) % 4)
-        table += tag + struct.pack(">II", at + len(body), len(data))
-        body += padded
-    size = at + len(body)
-    header = struct.pack(">I4sI4s4s4s", size, b"\0" * 4, 0x02400000, b"mntr", b"RGB ", b"XYZ ")
-    header += struct.pack(">6H", 2025, 1, 1, 0, 0, 0) + b"acsp" + bytes(28)
-    header += struct.pack(">3i", 63190, 65536, 54061) + bytes(48)
-    return header + struct.pack(">I", len(tags)) + table + body
+def _dated(icc: bytes) -> bytes:
+    """Give a profile a fixed date: the same bytes each time."""
+    return icc[:24] + struct.pack(">6H", 2025, 1, 1, 0, 0, 0) + icc[36:]
 
 
-def matrix3(matrix: Matrix | None) -> Matrix3 | None:
-    """Return a matrix as nested tuples, which are hashable and travel as JSON."""
-    return None if matrix is None else cast("Matrix3", tuple(map(tuple, matrix[:3, :3].tolist())))
+def linear_profile(to_xyz_d50: Matrix) -> bytes:
+    """Make an ICC profile of linear RGB: that of other primaries, with the given ones in their place."""
+    xyy_of_d50, xyy = (0.3457, 0.3585, 1.0), (0.64, 0.33, 1.0, 0.3, 0.6, 1.0, 0.15, 0.06, 1.0)
+    other = imagecodecs.cms_profile("rgb", gamma=1.0, whitepoint=xyy_of_d50, primaries=xyy)
+    icc = bytearray(_dated(other))
+    table = icc[132 : 132 + 12 * int.from_bytes(icc[128:132], "big")]
+    for name, at, _ in struct.iter_unpack(">4sII", table):
+        if name in {b"rXYZ", b"gXYZ", b"bXYZ"}:
+            column = to_xyz_d50[:, b"rgb".index(name[:1])]
+            icc[at + 8 : at + 20] = np.rint(65536.0 * column).astype(">i4").tobytes()
+    return bytes(icc)
 
 
 def camera_to_srgb(xyz_to_camera: Matrix) -> Matrix | None:
@@ -202,9 +160,3 @@ def camera_to_srgb(xyz_to_camera: Matrix) -> Matrix | None:
         return None
     balanced = srgb_to_camera / sums
     return np.linalg.inv(balanced) if abs(np.linalg.det(balanced)) > 1e-6 else None
-
-
-def named_profile(name: Literal["srgb", "adobergb"]) -> bytes:
-    """Return the profile of a standard colour space, of a fixed date: the same bytes each time."""
-    icc = imagecodecs.cms_profile(name)
-    return icc[:24] + struct.pack(">6H", 2025, 1, 1, 0, 0, 0) + icc[36:]

@@ -21,13 +21,7 @@ from typing import Final, cast
 
 from PIL.JpegImagePlugin import JpegImageFile
 
-from lensmodel.core.errors import (
-    DecompressionBombError,
-    ImageTooLargeError,
-    NotAnImageError,
-    TruncatedImageError,
-    UnsupportedFormatError,
-)
+from lensmodel.core import errors
 from lensmodel.photo.tiff import MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, Tags, TiffReader
 from lensmodel.photo.values import FileKind, Limits
 
@@ -64,11 +58,11 @@ def check_size(width: int, height: int, file_bytes: int, limits: Limits) -> None
     """Refuse what would be too large to decode."""
     megapixels = width * height / 1e6
     if megapixels > BOMB_MEGAPIXELS and width * height > BOMB_PIXELS_PER_BYTE * max(file_bytes, 1):
-        raise DecompressionBombError(
+        raise errors.DecompressionBombError(
             f"{file_bytes} bytes claim to be {width} x {height} pixels; no photograph is packed like that"
         )
     if megapixels > limits.max_megapixels:
-        raise ImageTooLargeError(
+        raise errors.ImageTooLargeError(
             f"{width} x {height} pixels are {megapixels:.0f} MP; "
             f"the limit is {limits.max_megapixels:g} MP, scale or crop it"
         )
@@ -105,10 +99,12 @@ def sniff(head: bytes) -> FileKind:
         if head.startswith(magic, at):
             if kind in _PARSERS:
                 return cast("FileKind", kind)
-            raise UnsupportedFormatError(f"{kind} files are not read; {_READABLE}")
+            raise errors.UnsupportedFormatError(f"{kind} files are not read; {_READABLE}")
     if not head:
-        raise NotAnImageError(f"the file is empty; {_READABLE}")
-    raise NotAnImageError(f"the first bytes ({head[:8].hex(' ')}) belong to no photo format; {_READABLE}")
+        raise errors.NotAnImageError(f"the file is empty; {_READABLE}")
+    raise errors.NotAnImageError(
+        f"the first bytes ({head[:8].hex(' ')}) belong to no photo format; {_READABLE}"
+    )
 
 
 @contextlib.contextmanager
@@ -118,7 +114,7 @@ def opened_header(path: Path, limits: Limits) -> Iterator[Header]:
         read = _PARSERS[sniff(file.read(HEAD_BYTES))]
         size = file.seek(0, 2)
         if size > limits.max_bytes:
-            raise ImageTooLargeError(f"the file has {size} bytes; the limit is {limits.max_bytes}")
+            raise errors.ImageTooLargeError(f"the file has {size} bytes; the limit is {limits.max_bytes}")
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as buffer:
             header = read(buffer, limits)
             check_size(header.width, header.height, size, limits)
@@ -129,44 +125,32 @@ def opened_header(path: Path, limits: Limits) -> Iterator[Header]:
 
 _END_OF_IMAGE: Final = b"\xff\xd9"  # marker: ITU-T T.81, table B.1
 _MAX_READS: Final = 1 << 17  # of a header: four of each segment and one of each stray byte (chosen)
-_PART_NUMBER, _PART_DATA = 12, 14  # of a part of a profile, behind the identifying text
 
 
 class JpegSegments(io.BytesIO):
-    """Bytes of a JPEG for Pillow; Exif and profile in its header are kept here, and blank there.
+    """Bytes of a JPEG for Pillow; Exif in its header is kept here, and blank there.
 
-    Pillow joins blocks of Exif in quadratic time, reads all values of their directories into memory however
-    often they overlap, and drops an ICC profile whose parts are counted wrongly.
+    Pillow joins blocks of Exif in quadratic time, and reads all values of their directories into memory
+    however often they overlap.
     """
 
     def __init__(self, data: bytes) -> None:
         super().__init__(data)
-        self.exif, self.parts = list[bytes](), list[bytes]()
-        self.reads, self.in_header = 0, True
+        self.exif, self.reads, self.in_header = list[bytes](), 0, True
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read on, as a file does."""
         data = super().read(size)
-        if not self.in_header:
-            return data
-        self.reads += 1
+        self.reads += self.in_header
         if self.reads > _MAX_READS:
-            raise NotAnImageError(
+            raise errors.NotAnImageError(
                 f"the JPEG's header does not end within {_MAX_READS // 4} segments, or "
                 f"{_MAX_READS} stray bytes; save it anew from the original"
             )
-        if data.startswith(b"Exif\0"):
-            self.exif.append(data)
-        elif data.startswith(b"ICC_PROFILE\0"):
-            self.parts.append(data)
-        else:
+        if not (self.in_header and data.startswith(b"Exif\0")):
             return data
+        self.exif.append(data)
         return bytes(len(data))
-
-    def profile(self) -> bytes | None:
-        """Put the parts of the ICC profile together by their numbers, however many they say to be."""
-        ordered = sorted(dict.fromkeys(self.parts), key=lambda part: part[_PART_NUMBER : _PART_NUMBER + 1])
-        return b"".join(part[_PART_DATA:] for part in ordered) if ordered else None
 
 
 def opened_jpeg(segments: JpegSegments) -> JpegImageFile:
@@ -183,19 +167,21 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
         image = opened_jpeg(segments)
     except (OSError, SyntaxError, ValueError) as error:
         if segments.tell() < len(segments.getbuffer()):
-            raise NotAnImageError(
+            raise errors.NotAnImageError(
                 f"the JPEG has no frame header, or none of 8 bits ({error}); save it anew from the original"
             ) from error
-        raise TruncatedImageError(f"the JPEG ends inside its header; {COPY_AGAIN}") from error
-    readers = (TiffReader.open(block, 6) for block in segments.exif)
+        raise errors.TruncatedImageError(f"the JPEG ends inside its header; {COPY_AGAIN}") from error
+    # Pillow drops a profile whose parts say to be more, or fewer; the byte behind the word is their number
+    parts = dict.fromkeys(data for _, data in image.applist if data.startswith(b"ICC_PROFILE\0"))
+    profile = b"".join(part[14:] for part in sorted(parts, key=lambda part: part[12:13]))
     whole = buffer.find(_END_OF_IMAGE, segments.tell()) >= 0  # in a scan a zero follows each byte of 0xFF
     return Header(
         "jpeg",
         *image.size,
         channels=image.layers,
-        tiff=tuple(reader for reader in readers if reader is not None),
+        tiff=tuple(TiffReader.open(block, 6) for block in segments.exif),
         xmp=image.info.get("xmp"),
-        icc=segments.profile(),
+        icc=profile if parts else None,
         # cameras give the first table to luma
         coarseness=float(statistics.median(image.quantization.get(0, [0]))),
         chroma_step=_chroma_step(image.layer),
@@ -215,12 +201,11 @@ def _chroma_step(layers: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]
 # --- PNG ---------------------------------------------------------------------------------------
 
 _OF_PICTURE: Final = {b"PLTE", b"tRNS", b"IDAT"}
-# What PNG chunks hold for sRGB, in their order of precedence: ITU-T H.273; 100,000 times a gamma and places
-# x, y of white, red, green, blue, and how far others round these (chosen)
+# What the chunks that declare colours hold for sRGB: ITU-T H.273; PNG, section 11.3.2
 _OF_SRGB: Final = {
-    b"cICP": (">4B", (1, 13, 0, 1), 0),
-    b"gAMA": (">I", (45455,), 500),
-    b"cHRM": (">8I", (31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000), 400),
+    b"cICP": bytes((1, 13, 0, 1)),
+    b"gAMA": struct.pack(">I", 45455),
+    b"cHRM": struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000),
 }
 _HDR: Final = {b"\x10", b"\x12"}  # curves PQ and HLG in cICP, which goes before a profile
 _READ: Final = {b"IDAT", b"eXIf", b"iCCP", b"iTXt", b"sRGB", *_OF_SRGB}
@@ -231,14 +216,14 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     """Read the chunks; image data are skipped, not read."""
     first = bytes(buffer[8:33])
     if len(first) < 25:
-        raise TruncatedImageError(f"the PNG ends inside its header; {COPY_AGAIN}")
+        raise errors.TruncatedImageError(f"the PNG ends inside its header; {COPY_AGAIN}")
     if first[4:8] != b"IHDR" or zlib.crc32(first[4:21]) != struct.unpack(">I", first[21:])[0]:
-        raise NotAnImageError("the PNG's header chunk is damaged")
+        raise errors.NotAnImageError("the PNG's header chunk is damaged")
     width, height, bits, colour = struct.unpack(">IIBB", first[8:18])
     channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0)
     if not (width and height and channels and bits in {1, 2, 4, 8, 16}):
         said = f"{width} x {height}, {bits} bits, type {colour}"
-        raise NotAnImageError(f"the PNG's header is impossible: {said}")
+        raise errors.NotAnImageError(f"the PNG's header is impossible: {said}")
     check_size(width, height, len(buffer), limits)  # before a bomb's end is missed
     found = dict[bytes, bytes]()
     for name, start, length in png_chunks(buffer):
@@ -247,35 +232,26 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
             if name != b"iTXt" or body.startswith(b"XML:com.adobe.xmp\0"):
                 found.setdefault(name, body)
     if b"IDAT" not in found:
-        raise TruncatedImageError("the PNG has no image data")
-    exif, text = TiffReader.open(found.get(b"eXIf", b"")), found.get(b"iTXt", b"")
+        raise errors.TruncatedImageError("the PNG has no image data")
+    text = found.get(b"iTXt", b"")
     xmp = text[20:].partition(b"\0")[2].partition(b"\0")[2]
     icc = (_inflated(found[b"iCCP"].partition(b"\0")[2][1:]) or b"") if b"iCCP" in found else None
-    if not icc or found.get(b"cICP", b"")[1:2] in _HDR:
-        _require_srgb(found)
+    known = _OF_SRGB if b"sRGB" not in found else {b"cICP"}  # sRGB goes before gAMA and cHRM
+    other = b", ".join(name for name in known if found.get(name, _OF_SRGB[name]) != _OF_SRGB[name])
+    if (other and not icc) or found.get(b"cICP", b"")[1:2] in _HDR:
+        raise errors.UnsupportedFormatError(
+            f"the PNG's {other.decode()} declares colours other than sRGB; convert it to sRGB, or save it "
+            "with an ICC profile"
+        )
     return Header(
         "png",
         width,
         height,
         channels,
-        tiff=() if exif is None else (exif,),
+        tiff=(TiffReader.open(found.get(b"eXIf", b"")),),
         xmp=_inflated(xmp) if text[18:19] == b"\1" else xmp,
         icc=icc,
     )
-
-
-def _require_srgb(chunks: Mapping[bytes, bytes]) -> None:
-    """Refuse a PNG whose chunks declare other colours where no profile gives them: they would be lost."""
-    for name, (numbers, of_srgb, tolerance) in _OF_SRGB.items():
-        body = chunks.get(name, b"")
-        said = struct.unpack(numbers, body) if len(body) == struct.calcsize(numbers) else ()
-        if any(said) and max(abs(a - b) for a, b in zip(said, of_srgb, strict=True)) > tolerance:
-            raise UnsupportedFormatError(
-                f"the PNG's chunk {name.decode()} declares colours other than sRGB; convert it to sRGB, or "
-                "save it with an ICC profile"
-            )
-        if b"sRGB" in chunks:
-            return  # goes before gAMA and cHRM
 
 
 def png_chunks(buffer: Buffer, *, every: bool = False) -> Iterator[tuple[bytes, int, int]]:
@@ -284,10 +260,10 @@ def png_chunks(buffer: Buffer, *, every: bool = False) -> Iterator[tuple[bytes, 
     while count < MAX_CHUNKS:
         head = bytes(buffer[at : at + 8])
         if len(head) < 8:
-            raise TruncatedImageError(f"the PNG ends before its end chunk; {COPY_AGAIN}")
+            raise errors.TruncatedImageError(f"the PNG ends before its end chunk; {COPY_AGAIN}")
         length, name = struct.unpack(">I4s", head)
         if at + 12 + length > len(buffer):
-            raise TruncatedImageError(f"the PNG ends inside chunk {name!r}; {COPY_AGAIN}")
+            raise errors.TruncatedImageError(f"the PNG ends inside chunk {name!r}; {COPY_AGAIN}")
         if name == b"IEND":
             return
         again = name == before == b"IDAT"
@@ -332,9 +308,9 @@ _OTHER_COLOURS: Final = {0: "inverted grey", 3: "a palette", 5: "CMYK", 6: "YCbC
 def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Header:
     """Read the directories; tells TIFF from DNG and from RAW files that look like TIFF."""
     reader = TiffReader.open(buffer)
-    every = [] if reader is None else list(reader.walk(SUB_DIRECTORIES))
-    if reader is None or not every:
-        raise TruncatedImageError(f"the TIFF has no readable directory; {COPY_AGAIN}")
+    every = list(reader.walk(SUB_DIRECTORIES))
+    if not every:
+        raise errors.TruncatedImageError(f"the TIFF has no readable directory; {COPY_AGAIN}")
     first = every[0][1]
     if _DNG_VERSION in first:
         kind = "dng"
@@ -357,16 +333,17 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
     check_size(header.width, header.height, len(buffer), limits)
     if kind != "tiff":
         _check_mosaic(photo)
-        if header.compression != LOSSY_DNG:
-            return header
-        tile = buffer[starts[0] : starts[0] + min(lengths[0], MAX_BLOCK_BYTES)] if starts and lengths else b""
-        with contextlib.suppress(NotAnImageError, TruncatedImageError):
-            return replace(header, coarseness=_read_jpeg(tile, Limits()).coarseness)  # the first for all
+        if header.compression == LOSSY_DNG and starts and lengths:
+            tile = buffer[starts[0] : starts[0] + min(lengths[0], MAX_BLOCK_BYTES)]  # the first for all
+            with contextlib.suppress(errors.NotAnImageError, errors.TruncatedImageError):
+                return replace(header, coarseness=_read_jpeg(tile, limits).coarseness)
         return header
     if len(every) >= MAX_DIRECTORIES:
-        raise UnsupportedFormatError(f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo")
+        raise errors.UnsupportedFormatError(
+            f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo"
+        )
     if not _pixels(photo) or not all(photo.keys() & either for either in _STRIPS):
-        raise NotAnImageError(
+        raise errors.NotAnImageError(
             f"the TIFF gives no size ({header.width} x {header.height}) or no strips: it holds no picture"
         )
     _check_numbers(photo)
@@ -390,7 +367,7 @@ def require_known_mosaic(rows: Sequence[str]) -> None:
     height, width = len(rows), min(map(len, rows), default=0)
     bayer = (height, width) == (2, 2) and "".join(rows) in {"RGGB", "BGGR", "GRBG", "GBRG"}
     if not bayer and (height, width) != (6, 6):
-        raise UnsupportedFormatError(
+        raise errors.UnsupportedFormatError(
             f"the colours of the sensor repeat every {height} x {width} pixels ({' '.join(rows)}); only "
             "2 x 2 Bayer mosaics and X-Trans are read: have the camera or a raw converter bin or develop it"
         )
@@ -411,7 +388,7 @@ def _check_numbers(tags: Tags) -> None:
     form = tags.integer(339, 1)
     if not read or bits not in _DEPTHS.get(form, ()):
         colours = _OTHER_COLOURS.get(kind, f"PhotometricInterpretation {kind}")
-        raise UnsupportedFormatError(
+        raise errors.UnsupportedFormatError(
             f"the TIFF holds no RGB or grey of unsigned 8 or 16 bits, or of floating-point numbers, but "
             f"{samples} samples of {bits} bits, SampleFormat {form}, {colours}; convert it"
         )
@@ -427,17 +404,16 @@ def _read_raw(buffer: Buffer, limits: Limits) -> Header:
     head = bytes(buffer[: 1 << 16])
     if head[4:12] == b"ftypcrx ":
         boxes = (head.find(name) for name in (b"CMT1", b"CMT2"))  # camera and EXIF of a CR3
-        readers = (TiffReader.open(buffer, at + 4) for at in boxes if at > 0)
-        return Header("raw", tiff=tuple(reader for reader in readers if reader is not None))
+        return Header("raw", tiff=tuple(TiffReader.open(buffer, at + 4) for at in boxes if at > 0))
     if head[6:].startswith(b"HEAPCC"):
         named = _CIFF_CAMERA.search(buffer)
         return Header("raw", camera=("Canon", "" if named is None else named[1].decode("ascii")))
     if head.startswith(b"FUJIFILMCCD"):
         at = int.from_bytes(head[84:88], "big")  # of a JPEG
-        with contextlib.suppress(NotAnImageError, TruncatedImageError):
+        with contextlib.suppress(errors.NotAnImageError, errors.TruncatedImageError):
             preview = _read_jpeg(buffer[at : at + MAX_BLOCK_BYTES], limits)
             return Header("raw", tiff=preview.tiff, xmp=preview.xmp)
-    with contextlib.suppress(TruncatedImageError):
+    with contextlib.suppress(errors.TruncatedImageError):
         return _read_tiff(buffer, limits, "raw")
     return Header("raw")
 

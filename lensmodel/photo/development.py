@@ -19,39 +19,10 @@ import rawpy
 import tifffile
 from numpy.typing import ArrayLike, NDArray
 
-from lensmodel.core.errors import (
-    InvalidInputError,
-    LensModelError,
-    MetadataMissingError,
-    NotAnImageError,
-    RawDecodeError,
-    TruncatedImageError,
-    UnreadablePhotoError,
-    UnsupportedFormatError,
-)
+from lensmodel.core import errors
 from lensmodel.core.types import CHANNELS, Frame, LensSettings, NoiseModel, Planes
-from lensmodel.photo.colour import (
-    CODES,
-    SRGB_TO_XYZ_D65,
-    Matrix,
-    camera_to_srgb,
-    curves_of,
-    decode,
-    is_of_rgb,
-    matrix3,
-    matrix_profile,
-    named_profile,
-)
-from lensmodel.photo.containers import (
-    COPY_AGAIN,
-    LOSSY_DNG,
-    Header,
-    JpegSegments,
-    check_size,
-    opened_header,
-    opened_jpeg,
-    png_picture,
-)
+from lensmodel.photo import colour, containers
+from lensmodel.photo.containers import COPY_AGAIN
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
@@ -85,7 +56,7 @@ def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
 def _opened(path: Path, limits: Limits) -> Iterator[tuple[Said, rawpy.RawPy | None]]:
     """Open a file once: what its header says, and LibRaw where it is a RAW file."""
     with contextlib.ExitStack() as stack:
-        said = Said.of(stack.enter_context(opened_header(path, limits)))
+        said = Said.of(stack.enter_context(containers.opened_header(path, limits)))
         is_raw = said.header.kind in {"raw", "dng"}
         yield said, stack.enter_context(opened_raw(path)) if is_raw else None
 
@@ -94,22 +65,21 @@ def _info_of(path: Path, said: Said, raw: rawpy.RawPy | None, limits: Limits) ->
     header, metadata = said.header, said.metadata()
     width, height = header.width, header.height
     if raw is not None:
-        if (packing := _UNDECODED.get(header.compression)) is not None:
-            raise UnsupportedFormatError(
-                f"RAW data packed as {packing} are not read; convert it to a plain DNG or TIFF"
-            )
+        if packing := _UNDECODED.get(header.compression):
+            remedy = "convert it to a plain DNG or TIFF"
+            raise errors.UnsupportedFormatError(f"RAW data packed as {packing} are not read; {remedy}")
         width, height = raw.sizes.width, raw.sizes.height
         if header.camera is not None:
             metadata = _exposure_of(raw, metadata)
-        check_size(width, height, path.stat().st_size, limits)
-    if header.kind == "jpeg" and header.channels == 4:
-        raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
+        containers.check_size(width, height, path.stat().st_size, limits)
+    kind = header.kind.upper()
+    if kind == "JPEG" and header.channels == 4:
+        raise errors.UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
     if not header.whole:
-        raise TruncatedImageError(f"the {header.kind.upper()} ends before its picture does; {COPY_AGAIN}")
+        raise errors.TruncatedImageError(f"the {kind} ends before its picture does; {COPY_AGAIN}")
     if min(width, height) < MIN_SIDE:
-        raise NotAnImageError(
-            f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
-        )
+        said_so = f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
+        raise errors.NotAnImageError(said_so)
     # no camera stores a picture higher than wide and says that it lies
     upright = raw is None and height > width and metadata.orientation == 1
     turned = upright and metadata.camera_model is not None
@@ -121,9 +91,9 @@ def develop(
 ) -> LinearPhoto:
     """Develop a photo: RAW through LibRaw, TIFF, PNG and JPEG through their transfer curve.
 
-    The planes are in sensor orientation, whatever the file says about turning them; RAW is in
-    camera colors before white balance, others in the primaries of their profile. Curves are those of
-    sRGB [1]_ or of the file's own profile [2]_; noise is measured on flat places, of RAW on its mosaic too.
+    RAW is in camera colors before white balance, others in the primaries of their profile. Curves are those
+    of sRGB (IEC 61966-2-1:1999) or of the file's own profile (ICC.1:2022, sections 10.6 and 10.18); noise is
+    measured on flat places, of RAW on its mosaic too.
 
     Parameters
     ----------
@@ -138,21 +108,16 @@ def develop(
     -------
     LinearPhoto
         `.planes` is float32 of shape (3, height, width): linear light, black 0 and saturation 1, in sensor
-        orientation; with the noise of each plane, metadata and encoding.
+        orientation, whatever the file says about turning it; with noise, metadata and encoding.
 
     Raises
     ------
-    FileNotFoundError
-        If there is no such file; another `OSError` if it may not be read.
+    OSError
+        If there is no such file, or it may not be read.
     UnreadablePhotoError
         One of its kinds, if the file cannot be decoded or holds no picture.
     ImageTooLargeError
         If it is larger than the limits allow.
-
-    References
-    ----------
-    .. [1] IEC 61966-2-1:1999.
-    .. [2] ICC.1:2022, sections 10.6 and 10.18.
     """
     path, limits = Path(path), limits or Limits()
     with _opened(path, limits) as (said, raw):
@@ -160,7 +125,8 @@ def develop(
         try:
             if on_info is not None:
                 on_info(info)
-        except MetadataMissingError:  # of a photo that is damaged nobody shall look up what it does not say
+        except errors.MetadataMissingError:
+            # of a photo that is damaged nobody shall look up what it does not say
             _read_pixels(path, said.header) if raw is None else Mosaic.of(raw)
             raise
         developed = _develop_raster(path, said, info) if raw is None else _develop_raw(raw, said, info)
@@ -186,14 +152,12 @@ def photo_from_array(
     planes : array_like of float, shape (3, height, width)
         Red, green and blue in linear light: black 0, saturation at `clip`; kept as float32.
     noise : NoiseModel or sequence of three, optional
-        Variance of the pixels against their level; None measures it on the flat places of each plane
-        (`estimate_noise`).
+        Variance of the pixels against their level; None measures it on the flat places of each plane.
     clip : float
         Level at which the sensor saturates.
-    aperture : float, optional
-        f-number, 0.5 to 128; `focal_mm` in mm and `focus_m` in metres as far as they are known.
-    pixel_pitch_um : float, optional
-        Pitch of the pixels in micrometres, above 0.
+    aperture, focal_mm, focus_m, pixel_pitch_um : float, optional
+        f-number, 0.5 to 128; focal length in mm, focus distance in metres and pitch of the pixels in
+        micrometres, as far as they are known.
 
     Returns
     -------
@@ -206,31 +170,29 @@ def photo_from_array(
     """
     array = np.ascontiguousarray(planes, dtype=np.float32)
     if array.ndim != 3 or array.shape[0] != len(CHANNELS) or array.size == 0:
-        raise InvalidInputError(f"a photo must have the shape (3, height, width), got {array.shape}")
+        raise errors.InvalidInputError(f"a photo must have the shape (3, height, width), got {array.shape}")
     if not np.isfinite(array).all():
-        raise InvalidInputError("a photo must be finite; mask or replace NaN and infinity first")
+        raise errors.InvalidInputError("a photo must be finite; mask or replace NaN and infinity first")
     if not clip > 0.0:
-        raise InvalidInputError(f"clip must be a positive level, got {clip}")
+        raise errors.InvalidInputError(f"clip must be a positive level, got {clip}")
     LensSettings(aperture, focal_mm, focus_m)  # refuses what no lens has
-    if pixel_pitch_um is not None and not (math.isfinite(pixel_pitch_um) and pixel_pitch_um > 0.0):
-        raise InvalidInputError(
-            f"the pixel pitch must be positive micrometres, got {pixel_pitch_um}; leave it out if unknown"
-        )
-    if isinstance(noise, NoiseModel):
-        noise = (noise,) * 3
-    known = tuple(noise) if noise is not None else tuple(estimate_noise(plane, clip) for plane in array)
-    if len(known) != len(CHANNELS):
-        raise InvalidInputError(f"noise needs one model, or one for each of three planes, got {len(known)}")
-    _, height, width = array.shape
+    if pixel_pitch_um is not None and not 0.0 < pixel_pitch_um < math.inf:
+        said = f"the pixel pitch must be positive micrometres, got {pixel_pitch_um}; leave it out if unknown"
+        raise errors.InvalidInputError(said)
+    given = (noise,) * 3 if isinstance(noise, NoiseModel) else noise
+    models = tuple(estimate_noise(plane, clip) for plane in array) if given is None else tuple(given)
+    if len(models) != len(CHANNELS):
+        raise errors.InvalidInputError(f"noise needs one model, or one for each plane, got {len(models)}")
     metadata = PhotoMetadata(
         aperture=aperture, focal_mm=focal_mm, focus_m=focus_m, pixel_pitch_um=pixel_pitch_um
     )
+    frame = Frame(*array.shape[1:])
     return LinearPhoto(
         planes=array,
-        frame=Frame(height, width),
-        noise=(known[0], known[1], known[2]),
+        frame=frame,
+        noise=models,
         clip=(clip,) * 3,
-        info=PhotoInfo("tiff", width, height, metadata),
+        info=PhotoInfo("tiff", frame.width, frame.height, metadata),
         encoding=Encoding(bit_depth=32, transfer="linear", metadata=metadata),
     )
 
@@ -259,22 +221,19 @@ def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
         with rawpy.RawPy() as raw:
             raw.open_file(str(path))
             yield raw
-    except (LensModelError, MemoryError):
+    except (errors.LensModelError, MemoryError):
         raise
     except (rawpy.LibRawFileUnsupportedError, rawpy.LibRawIOError) as error:
         with path.open("rb") as file:
             head = file.read(16)
         if isinstance(error, rawpy.LibRawIOError) or any(head.startswith(m, at) for at, m in _KNOWN_WHOLE):
-            raise TruncatedImageError(
-                f"the RAW file is damaged, or ends before its data do; {COPY_AGAIN}"
-            ) from error
-        raise UnsupportedFormatError(
-            "this kind of RAW is not supported by LibRaw; convert it to DNG or TIFF"
-        ) from error
+            said = f"the RAW file is damaged, or ends before its data do; {COPY_AGAIN}"
+            raise errors.TruncatedImageError(said) from error
+        said = "this kind of RAW is not supported by LibRaw; convert it to DNG or TIFF"
+        raise errors.UnsupportedFormatError(said) from error
     except Exception as error:
-        raise RawDecodeError(
-            f"LibRaw cannot decode this file ({error}); convert it to DNG or TIFF"
-        ) from error
+        said = f"LibRaw cannot decode this file ({error}); convert it to DNG or TIFF"
+        raise errors.RawDecodeError(said) from error
 
 
 def _exposure_of(raw: rawpy.RawPy, camera: PhotoMetadata) -> PhotoMetadata:
@@ -301,7 +260,7 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
     """
     tags, mosaic, white, clip = said.tags, Mosaic.of(raw), int(raw.white_level), (1.0, 1.0, 1.0)
     # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing, and stretches them
-    lossy = said.header.compression == LOSSY_DNG
+    lossy = said.header.compression == containers.LOSSY_DNG
     opcodes = b"" if lossy else tags.raw(OPCODES_2)
     stated = () if lossy else tags.integers(_WHITE, 3)
     sensor_noise, cfa, remarks = None, None, list[str]()
@@ -331,14 +290,14 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
             bit_depth=max(1, white.bit_length()),
             metadata=info.metadata.without_serials(),
             white_balance=balance,
-            to_srgb=matrix3(to_srgb),
-            xyz_to_camera=matrix3(xyz_to_camera),
+            to_srgb=to_srgb,
+            xyz_to_camera=xyz_to_camera,
             baseline_exposure=said.baseline_exposure(),
             opcodes_2=opcodes,
             opcodes_3=tags.raw(OPCODES_3),
         ),
         sensor_noise=sensor_noise,
-        coding_noise=coding_noise(said.header.coarseness, curves_of("srgb")[1]),
+        coding_noise=coding_noise(said.header.coarseness, colour.curves_of("srgb")[1]),
         cfa=cfa,
         grain=(1.0, 1.0, 1.0) if sensor_noise is not None else grain_of(planes, noise, clip),
         remarks=tuple(remarks),
@@ -380,7 +339,7 @@ def _developed(
         )
     )
     if rgb.ndim != 3 or rgb.shape[2] not in {1, 3}:
-        raise UnsupportedFormatError("only RAW files of three colours, or none, are read")
+        raise errors.UnsupportedFormatError("only RAW files of three colours, or none, are read")
     planes: Planes = np.empty((3, *rgb.shape[:2]), dtype=np.float32)
     for k, plane in enumerate(planes):
         # LibRaw rounds down, and so do we: saturated pixels become 1.0 and not a little less.
@@ -388,7 +347,7 @@ def _developed(
         np.multiply(rgb[:, :, min(k, rgb.shape[2] - 1)], scale, out=plane)
         np.minimum(plane, np.float32(1.0), out=plane)
     if float(planes.max()) <= 0.0:
-        raise RawDecodeError("the developed photo is black everywhere; the file holds no picture")
+        raise errors.RawDecodeError("the developed photo is black everywhere; the file holds no picture")
     return planes
 
 
@@ -403,13 +362,11 @@ def _plane_noise(
         shot_c = sum_s M_cs shot_s  w_s / w_c      (where the scene is grey)
     """
     if sensor is None:
-        r, g, b = (estimate_noise(plane, step=1 / _FULL) for plane in planes)
-        return r, g, b
+        return tuple(estimate_noise(plane, step=1 / _FULL) for plane in planes)
     weight = np.asarray(balance)[None, :] / np.asarray(balance)[:, None]
     shot = (_NOISE_MIX * weight) @ np.array([model.shot for model in sensor])
     read = (_NOISE_MIX * weight**2) @ np.array([model.read for model in sensor])
-    r, g, b = (NoiseModel(float(a), float(c)) for a, c in zip(shot, read, strict=True))
-    return r, g, b
+    return tuple(NoiseModel(float(a), float(c)) for a, c in zip(shot, read, strict=True))
 
 
 def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], bool]:
@@ -418,32 +375,28 @@ def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], bool]:
     Where it wrote none, LibRaw makes what is not saturated grey on average; of the dark, daylight's serve.
     """
 
-    def of_the_picture() -> Sequence[float]:
-        raw.postprocess(use_auto_wb=True, half_size=True, output_bps=8)
-        return raw.auto_whitebalance or (0.0, 0.0, 0.0)
+    def balanced(r: float, g: float, b: float, *_: float) -> tuple[float, float, float] | None:
+        usable = min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20  # others are absurd
+        return (float(r) / float(g), 1.0, float(b) / float(g)) if usable else None
 
-    for own, multipliers in (
-        (True, lambda: raw.camera_whitebalance),
-        (False, of_the_picture),
-        (False, lambda: raw.daylight_whitebalance),
-    ):
-        r, g, b = multipliers()[:3]
-        if min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20:  # others are absurd
-            return (float(r) / float(g), 1.0, float(b) / float(g)), own
-    return (1.0, 1.0, 1.0), False
+    if own := balanced(*raw.camera_whitebalance):
+        return own, True
+    raw.postprocess(use_auto_wb=True, half_size=True, output_bps=8)
+    of_the_picture = balanced(*(raw.auto_whitebalance or (0.0, 0.0, 0.0)))
+    return of_the_picture or balanced(*raw.daylight_whitebalance) or (1.0, 1.0, 1.0), False
 
 
 def _colour(
     raw: rawpy.RawPy, white_balance: tuple[float, float, float]
-) -> tuple[Matrix | None, Matrix | None]:
+) -> tuple[colour.Matrix | None, colour.Matrix | None]:
     """White-balanced camera to linear sRGB, and CIE XYZ to camera; from the file, else LibRaw's table."""
     of_file = np.asarray(raw.color_matrix, dtype=np.float64)[:3, :3]
     of_table = np.asarray(raw.rgb_xyz_matrix, dtype=np.float64)[:3]
     if np.abs(of_table).sum() > 0:
-        return camera_to_srgb(of_table), of_table
+        return colour.camera_to_srgb(of_table), of_table
     if abs(np.linalg.det(of_file)) < 1e-6:
         return None, None
-    balanced = np.linalg.inv(SRGB_TO_XYZ_D65 @ of_file)
+    balanced = np.linalg.inv(colour.SRGB_TO_XYZ_D65 @ of_file)
     return of_file, balanced / np.asarray(white_balance)[:, None]
 
 
@@ -463,57 +416,48 @@ def _develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
     header, (pixels, transparent) = said.header, _read_pixels(path, said.header)
     height, width = pixels.shape[:2]
     if (height, width) != (info.height, info.width):
-        raise UnreadablePhotoError(
+        raise errors.UnreadablePhotoError(
             f"the header says {info.width} x {info.height}, the decoder gave {width} x {height}; save it anew"
         )
-    transfer, icc, without = _transfer_of(said, pixels)
-    curves = curves_of(transfer, icc)
-    planes: Planes = np.empty((3, height, width), dtype=np.float32)
-    for k, curve in enumerate(curves):
-        numbers = pixels[:, :, k]
-        planes[k] = numbers if numbers.dtype.kind == "f" and transfer == "linear" else decode(numbers, curve)
-    green, code = curves[1], {1: CODES // 255, 2: 1}.get(pixels.dtype.itemsize, 1)
-    codes = green[::code] if pixels.dtype.itemsize == 1 else None
-    clip = max(1.0, float(planes.max())) if pixels.dtype.kind == "f" else 1.0
-    r, g, b = (estimate_noise(plane, clip, float(green[code] - green[0]), codes) for plane in planes)
+    floating, depth, remarks = pixels.dtype.kind == "f", pixels.dtype.itemsize, list[str]()
+    if transparent:
+        remarks.append("its transparency is dropped")
+    transfer, icc = _transfer_of(said, floating, remarks)
+    if info.turned:
+        remarks.append(_TURNED)
+    curves = colour.curves_of(transfer, icc)
+    planes: Planes = np.stack([colour.decode(pixels[:, :, k], curve) for k, curve in enumerate(curves)])
+    green, code = curves[1], colour.CODES // 255 if depth == 1 else 1
+    clip = (max(1.0, float(planes.max())) if floating else 1.0,) * 3
+    codes, step = green[::code] if depth == 1 else None, float(green[code] - green[0])
+    noise = tuple(estimate_noise(plane, clip[0], step, codes) for plane in planes)
     return LinearPhoto(
         planes=planes,
         frame=Frame(height, width),
-        noise=(r, g, b),
-        clip=(clip,) * 3,
+        noise=noise,
+        clip=clip,
         info=info,
-        encoding=Encoding(
-            bit_depth=8 * pixels.dtype.itemsize,
-            transfer=transfer,
-            icc=icc,
-            metadata=info.metadata.without_serials(),
-        ),
-        grain=grain_of(planes, (r, g, b), (clip,) * 3),
+        encoding=Encoding(8 * depth, transfer, icc, info.metadata.without_serials()),
+        grain=grain_of(planes, noise, clip),
         coding_noise=coding_noise(header.coarseness, green),
         chroma_step=header.chroma_step,
-        remarks=(
-            *(("its transparency is dropped",) if transparent else ()),
-            *without,
-            *((_TURNED,) if info.turned else ()),
-        ),
+        remarks=tuple(remarks),
     )
 
 
-def _transfer_of(said: Said, pixels: Pixels) -> tuple[Transfer, bytes | None, tuple[str, ...]]:
-    """Which curve the numbers follow, the profile for the output, and a word on one that is left out."""
-    icc, floating = said.header.icc, pixels.dtype.kind == "f"
-    if icc is not None and matrix_profile(icc) is not None:
-        return "icc", icc, ()
-    if icc is not None and not floating and is_of_rgb(icc):
-        return "srgb", icc, ()
-    declared = named_profile("adobergb") if said.adobe_rgb and not floating else None
-    instead = "its other tags say" if declared else "linear light" if floating else "sRGB"
-    without = f"its ICC profile is damaged or not for RGB: its colours are read as {instead}"
-    transfer: Transfer = "linear" if floating else "icc" if declared else "srgb"
-    return transfer, declared, (without,) if icc is not None else ()
+def _transfer_of(said: Said, floating: bool, remarks: list[str]) -> tuple[Transfer, bytes | None]:
+    """Which curve the numbers follow, and the profile for the output; one that is left out is remarked on."""
+    icc = said.header.icc
+    if colour.read_profile(icc) is not None:
+        return "icc", icc
+    declared = colour.named_profile("adobergb") if said.adobe_rgb and not floating else None
+    if icc is not None:
+        instead = "its other tags say" if declared else "linear light" if floating else "sRGB"
+        remarks.append(f"its ICC profile is damaged or not for RGB: its colours are read as {instead}")
+    return "linear" if floating else "icc" if declared else "srgb", declared
 
 
-def _read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:
+def _read_pixels(path: Path, header: containers.Header) -> tuple[Pixels, bool]:
     """Decode to numbers `(row, col, 3)`, and say whether alpha was dropped that was not opaque."""
     name = header.kind.upper()
     try:
@@ -525,18 +469,18 @@ def _read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:
             if pixels.ndim == 3 and page.planarconfig == 2:
                 pixels = np.moveaxis(pixels, 0, -1)
         elif header.kind == "png":
-            pixels = imagecodecs.png_decode(png_picture(path.read_bytes()))
+            pixels = imagecodecs.png_decode(containers.png_picture(path.read_bytes()))
         else:
-            with opened_jpeg(JpegSegments(path.read_bytes())) as image:
+            with containers.opened_jpeg(containers.JpegSegments(path.read_bytes())) as image:
                 pixels = np.asarray(image.convert("RGB"))
         alpha = pixels[:, :, -1] if pixels.ndim == 3 and pixels.shape[2] in {2, 4} else None
         return _three_channels(pixels), alpha is not None and bool((alpha != alpha.max()).any())
-    except (MemoryError, LensModelError):
+    except (MemoryError, errors.LensModelError):
         raise
     except Exception as error:  # decoders meet hostile files with exceptions of any kind
         if "truncated" in str(error):
-            raise TruncatedImageError(f"the {name} ends before its picture does ({error})") from error
-        raise NotAnImageError(f"the {name}'s pixel data are damaged ({error})") from error
+            raise errors.TruncatedImageError(f"the {name} ends before its picture does ({error})") from error
+        raise errors.NotAnImageError(f"the {name}'s pixel data are damaged ({error})") from error
 
 
 def _three_channels(pixels: Pixels) -> Pixels:
@@ -545,11 +489,13 @@ def _three_channels(pixels: Pixels) -> Pixels:
         known = pixels[np.isfinite(pixels)]
         pixels = np.nan_to_num(pixels, posinf=max(1.0, float(known.max(initial=0.0))), neginf=0.0)
     elif pixels.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
-        raise UnsupportedFormatError(
+        raise errors.UnsupportedFormatError(
             f"samples of type {pixels.dtype} are not read; save it with 8 or 16 bits"
         )
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.ndim != 3 or pixels.shape[2] > 4:
-        raise UnsupportedFormatError(f"a picture of shape {pixels.shape} is no photo; give RGB on one page")
+        raise errors.UnsupportedFormatError(
+            f"a picture of shape {pixels.shape} is no photo; give RGB on one page"
+        )
     return np.repeat(pixels[:, :, :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[:, :, :3]

@@ -25,28 +25,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Final, NamedTuple
 from xml.etree import ElementTree as ET
-from xml.sax.saxutils import escape, quoteattr
-
-import numpy as np
+from xml.sax.saxutils import quoteattr
 
 from lensmodel.core.errors import TruncatedImageError
+from lensmodel.photo import tiff
 from lensmodel.photo.containers import MAX_BLOCK_BYTES, Header, opened_header, png_chunks
-from lensmodel.photo.tiff import (
-    ASCII,
-    ENTRY,
-    EXIF,
-    GPS,
-    RATIONAL,
-    SHORT,
-    SUB_DIRECTORIES,
-    UNDEFINED,
-    Buffer,
-    Tag,
-    Tags,
-    TiffReader,
-    Value,
-    Written,
-)
+from lensmodel.photo.tiff import ASCII, RATIONAL, Buffer, Tag, Tags, TiffReader, Value, Written
 from lensmodel.photo.values import SOFTWARE, LensIdentity, Limits, PhotoMetadata, SerialSource
 
 log = logging.getLogger(__name__)
@@ -65,12 +49,9 @@ _NO_LENS: Final = re.compile(
 # Widths of one inch, Four Thirds, APS-C, APS-H, 24 x 36 and medium format
 _SENSORS_MM: Final = ((12.8, 13.4), (17.2, 18.1), (22.0, 24.1), (27.5, 29.0), (35.4, 36.4), (43.0, 54.1))
 
-_LARGEST_SENSOR_MM: Final = max(high for _, high in _SENSORS_MM)
-_FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)  # 36 x 24 mm
+_FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
 _CROP_FACTORS: Final = (0.5, 15.0)  # from medium format to the smallest phones
-
-# What lenses and sensors have, with room on either side.
-_PITCHES_UM: Final = (0.3, 60.0)
+_PITCHES_UM: Final = (0.3, 60.0)  # what sensors have, with room on either side
 
 
 def is_placeholder(serial: str) -> bool:
@@ -100,7 +81,7 @@ class Said:
             main, _ = reader.directory(reader.first)
             if header.directory:  # a preview may stand before the photo
                 main.update(reader.directory(header.directory)[0])
-            main.update(reader.below(main, EXIF))
+            main.update(reader.below(main, tiff.EXIF))
             if 0x927C in main:
                 note_in = reader
             tags = Tags({**main, **tags})
@@ -109,39 +90,27 @@ class Said:
 
     def metadata(self) -> PhotoMetadata:
         """Put it together; what cannot be read is unknown, and of a CRW file LibRaw tells the rest."""
-        tags, xmp, note = self.tags, self.xmp, self.note
+        text, number, xmp, note = self.tags.text, self.tags.number, self.xmp, self.note
         if self.header.camera is not None:
             return PhotoMetadata(self.header.camera[0], self.header.camera[1] or None)
-        direct, apex = tags.number(0x829D), tags.number(0x9202)  # N = 2^(A_v / 2)
-        if not direct and apex is not None and 0 < apex < 14:
-            direct = round(2.0 ** (apex / 2.0), 1)
-        speed = tags.number(0x8827)
         # The tag has 16 bits; above them cameras say 65535 and use the newer ones.
-        if not speed or speed >= 65535:
-            speed = tags.number(0x8832) or tags.number(0x8831) or speed
-        turned = tags.number(0x0112)
-        stars = _first_within(-1, 5, _quotient(xmp.get("xmp:Rating")), tags.number(0x4746))  # -1 is rejected
+        speeds = _first_within(1.0, 65534.0, number(0x8827)), number(0x8832), number(0x8831), note.iso
+        serials = text(0xA431), text(0xC62F), note.body_serial, xmp.get("aux:SerialNumber")
         return PhotoMetadata(
-            camera_maker=tags.text(0x010F) or xmp.get("tiff:Make"),
-            camera_model=tags.text(0x0110) or xmp.get("tiff:Model"),
-            body_serial=_first(
-                is_placeholder,
-                *(tags.text(0xA431), tags.text(0xC62F), note.body_serial),
-                *(xmp.get("aux:SerialNumber"), xmp.get("exifEX:BodySerialNumber")),
-            ),
+            camera_maker=text(0x010F) or xmp.get("tiff:Make"),
+            camera_model=text(0x0110) or xmp.get("tiff:Model"),
+            body_serial=_first(is_placeholder, *serials, xmp.get("exifEX:BodySerialNumber")),
             lens=self._lens(),
-            aperture=_first_within(0.5, 128.0, direct, _quotient(xmp.get("exif:FNumber"))),
-            focal_mm=_first_within(0.1, 2e4, tags.number(0x920A), _quotient(xmp.get("exif:FocalLength"))),
+            aperture=_first_within(0.5, 128.0, number(0x829D), _quotient(xmp.get("exif:FNumber"))),
+            focal_mm=_first_within(0.1, 2e4, number(0x920A), _quotient(xmp.get("exif:FocalLength"))),
             focus_m=self._focus_m(),
-            iso=_first_within(1.0, 1e7, speed, note.iso, _quotient(xmp.get("exif:ISOSpeedRatings"))),
-            exposure_s=_first_within(1e-7, 1e6, tags.number(0x829A), _quotient(xmp.get("exif:ExposureTime"))),
+            iso=_first_within(1.0, 1e7, *speeds, _quotient(xmp.get("exif:ISOSpeedRatings"))),
+            exposure_s=_first_within(1e-7, 1e6, number(0x829A), _quotient(xmp.get("exif:ExposureTime"))),
             taken_at=self._taken_at(),
-            orientation=int(turned) if turned is not None and 1 <= turned <= 8 else 1,
+            orientation=int(_first_within(1.0, 8.0, number(0x0112)) or 1),
             pixel_pitch_um=self._pixel_pitch_um(),
-            artist=tags.text(0x013B) or ", ".join(xmp.get("dc:creator", "").splitlines()) or None,
-            copyright=tags.text(0x8298) or xmp.get("dc:rights"),
-            rating=None if stars is None else int(stars),
-            keywords=tuple(xmp.get("dc:subject", "").splitlines()),
+            artist=text(0x013B) or xmp.get("dc:creator"),
+            copyright=text(0x8298) or xmp.get("dc:rights"),
         )
 
     def is_centred(self, metadata: PhotoMetadata) -> bool:
@@ -149,14 +118,11 @@ class Said:
         pitch, width, height = metadata.pixel_pitch_um, self.header.width, self.header.height
         if self.header.kind in {"raw", "dng"} or pitch is None:
             return True
-        if self.xmp.get("crs:HasCrop") == "True":
+        if self._was_cut:
             return False
-        width_mm = max(width, height) * pitch / 1000.0
         film = self._film_pitch_um()
         whole = film is not None and abs(pitch / film - 1.0) < 0.05
-        square = abs(width / height - 1.0) < 0.01
-        widths = [width_mm, *((width_mm * 3.0 / 2.0, width_mm * 4.0 / 3.0) if square else ())]
-        return whole or any(map(_is_width_of_sensor, widths)) or self._zoom > 1.01
+        return whole or _is_width_of_sensor(max(width, height) * pitch / 1000.0) or self._zoom > 1.01
 
     def baseline_exposure(self) -> float | None:
         """Stops by which a DNG asks to be brightened, None where it does not say or is absurd."""
@@ -173,6 +139,10 @@ class Said:
         """How much of the picture is enlarged from the middle of the sensor: DigitalZoomRatio."""
         return _first_within(1.0, 20.0, self.tags.number(0xA404)) or 1.0
 
+    @property
+    def _was_cut(self) -> bool:
+        return self.xmp.get("crs:HasCrop") == "True"
+
     def _taken_at(self) -> datetime | None:
         for tag in (0x9003, 0x9004, 0x0132):
             with contextlib.suppress(ValueError):
@@ -180,23 +150,22 @@ class Said:
         return None
 
     def _lens(self) -> LensIdentity:
-        tags, xmp = self.tags, self.xmp
+        tags, xmp, noted = self.tags, self.xmp, self.note.lens
         makers = tags.text(0xA433), xmp.get("exifEX:LensMake")
-        models = tags.text(0xA434), self.note.lens.model, xmp.get("aux:Lens"), xmp.get("exifEX:LensModel")
-        return LensIdentity(_first(is_placeholder, *makers), _first(names_no_lens, *models), *self._serial())
-
-    def _serial(self) -> tuple[str | None, SerialSource]:
-        declared, noted = self.tags.text(0xA435), self.note.lens.serial
+        models = tags.text(0xA434), noted.model, xmp.get("aux:Lens"), xmp.get("exifEX:LensModel")
+        declared = tags.text(0xA435)
         # A camera that fills the EXIF tag with zeros has looked and found no serial; what its maker
         # note holds beside it (seen: 1c00000000) is no serial either.
         sources: tuple[tuple[str | None, SerialSource], ...] = (
             (declared, "exif"),
-            (None if declared else noted, "makernote"),
-            (self.xmp.get("aux:LensSerialNumber"), "xmp"),
-            (self.xmp.get("exifEX:LensSerialNumber"), "xmp"),
+            (None if declared else noted.serial, "makernote"),
+            (xmp.get("aux:LensSerialNumber"), "xmp"),
+            (xmp.get("exifEX:LensSerialNumber"), "xmp"),
         )
-        known = ((serial, source) for serial, source in sources if serial and not is_placeholder(serial))
-        return next(known, (None, "none"))
+        unknown: tuple[str | None, SerialSource] = None, "none"
+        serials = (one for one in sources if one[0] and not is_placeholder(one[0]))
+        maker, model = _first(is_placeholder, *makers), _first(names_no_lens, *models)
+        return LensIdentity(maker, model, *next(serials, unknown))
 
     def _focus_m(self) -> float | None:
         # 0xffffffff is EXIF's word for infinity; as a plain number it also stands in XMP.
@@ -220,12 +189,11 @@ class Said:
         if pitch is not None:
             pitch /= self._zoom
             shorter, longer = sorted((header.width, header.height))
-            width_mm = longer * pitch / 1000.0
             mosaic = header.kind == "raw" or (header.kind == "dng" and header.channels == 1)
             # scaled down, a picture keeps the shape of its sensor, 3 : 2 or 4 : 3
             whole = any(abs(longer / max(shorter, 1) / shape - 1.0) < 0.01 for shape in (1.5, 4.0 / 3.0))
-            unscaled = mosaic or self.xmp.get("crs:HasCrop") == "True" or not whole
-            if _is_width_of_sensor(width_mm) or (width_mm <= _LARGEST_SENSOR_MM and unscaled):
+            width_mm, unscaled = longer * pitch / 1000.0, mosaic or self._was_cut or not whole
+            if _is_width_of_sensor(width_mm) or (unscaled and width_mm <= _SENSORS_MM[-1][1]):
                 return pitch
         film = self._film_pitch_um()
         return film and film / self._zoom
@@ -233,10 +201,8 @@ class Said:
     def _film_pitch_um(self) -> float | None:
         """Pitch of a frame whose diagonal is that of 35 mm film over the crop factor."""
         focal, film = self.tags.number(0x920A), self.tags.number(0xA405)
-        diagonal_px = math.hypot(self.header.width, self.header.height)
-        if not focal or not film or min(focal, film, diagonal_px) <= 0:
-            return None
-        crop = _first_within(*_CROP_FACTORS, film / focal)
+        crop = _first_within(*_CROP_FACTORS, film / focal if focal and film else None)
+        diagonal_px = max(math.hypot(self.header.width, self.header.height), 1.0)
         return crop and _first_within(*_PITCHES_UM, 1000.0 * _FILM_DIAGONAL_MM / crop / diagonal_px)
 
 
@@ -277,7 +243,7 @@ def _maker_note(maker: str, note: Tag, reader: TiffReader) -> PhotoMetadata:
         return PhotoMetadata(lens=LensIdentity(model=tags.text(0x0051), serial=tags.text(0x0052)))
     if maker.lower().startswith("canon"):
         return _canon(note, reader)
-    inner = TiffReader.open(buffer, start + 10) if head.startswith(b"Nikon\0\x02") else None
+    inner = head.startswith(b"Nikon\0\x02") and TiffReader.open(buffer, start + 10)
     if inner or (maker.lower().startswith("nikon") and not head.startswith(b"Nikon\0")):
         tags = (inner.directory(inner.first) if inner else reader.directory(at))[0]
         speed = [*tags.numbers(0x0002, 2), 0.0, 0.0][1]
@@ -288,7 +254,8 @@ def _maker_note(maker: str, note: Tag, reader: TiffReader) -> PhotoMetadata:
 def _canon(note: Tag, reader: TiffReader) -> PhotoMetadata:
     # Canon ends its notes with a TIFF header of its own byte order whose offset is the note's original place:
     # a program may have moved the note without rewriting its offsets.
-    if footer := TiffReader.open(reader.buffer, note.offset + note.size - 8):
+    footer = TiffReader.open(reader.buffer, note.offset + note.size - 8)
+    if footer.first:
         reader = TiffReader(reader.buffer, note.offset - footer.first, footer.order, footer.first)
     tags, _ = reader.directory(note.offset - reader.base)
     # Five bytes, of which exiftool prints ten hexadecimal digits; the number is in the last
@@ -319,7 +286,6 @@ def _olympus(reader: TiffReader, first: int) -> PhotoMetadata:
 # --- XMP ----------------------------------------------------------------------------------------
 
 MAX_XMP_BYTES: Final = 1 << 20  # against files made to fill the memory; real ones are some kilobytes
-_MOST_OF_A_LIST: Final = 16_384  # characters (chosen): some hundred keywords
 _RDF: Final = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
 _SPACES: Final[Mapping[str, str]] = {
     "http://ns.adobe.com/exif/1.0/aux/": "aux",
@@ -336,7 +302,7 @@ _SPACES: Final[Mapping[str, str]] = {
 
 
 def read_xmp(packet: bytes | None) -> Mapping[str, str]:
-    """Read the properties of a packet by prefix and name: of a list the first, of authors and keywords all.
+    """Read the properties of a packet by prefix and name: of a list the first.
 
     A packet that is damaged gives what came before the damage, one with a document type, the door to entity
     expansion, nothing: metadata that cannot be read are unknown, and no reason to refuse the photo.
@@ -355,12 +321,8 @@ def read_xmp(packet: bytes | None) -> Mapping[str, str]:
         name = name if element.tag.startswith("{" + _RDF) else element.tag
         for qualified, value in [*element.items(), (name, element.text or "")]:
             space, _, local = qualified.removeprefix("{").rpartition("}")
-            said, key = value.strip()[:1024], f"{_SPACES.get(space)}:{local}"
-            if not said or space not in _SPACES:
-                continue
-            before = properties.setdefault(key, said)
-            if key in {"dc:creator", "dc:subject"} and before is not said and len(before) < _MOST_OF_A_LIST:
-                properties[key] = f"{before}\n{said}"
+            if space in _SPACES and value.strip():
+                properties.setdefault(f"{_SPACES[space]}:{local}", value.strip()[:1024])
     return properties
 
 
@@ -368,7 +330,6 @@ _PACKET: Final = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF{spaces}>
 <rdf:Description rdf:about=""{properties}>
 <xmpMM:History><rdf:Seq><rdf:li{done}/></rdf:Seq></xmpMM:History>
-<dc:subject><rdf:Bag>{words}</rdf:Bag></dc:subject>
 </rdf:Description></rdf:RDF></x:xmpmeta>
 <?xpacket end="r"?>"""
 _CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF), " "))
@@ -383,15 +344,10 @@ def xmp_packet(metadata: PhotoMetadata, description: str, lens: str = "") -> byt
         return "".join(f" {name}={quoteattr(value.translate(_CHARACTERS))}" for name, value in known.items())
 
     done = {"stEvt:action": "filtered", "stEvt:softwareAgent": SOFTWARE, "stEvt:parameters": description}
-    named = lens or metadata.lens.model
-    known = {"xmp:CreatorTool": SOFTWARE, "xmp:Rating": metadata.rating, "aux:Lens": named}
     packet = _PACKET.format(
         spaces=attributes({f"xmlns:{prefix}": space for space, prefix in _SPACES.items()}),
-        properties=attributes(known),
+        properties=attributes({"xmp:CreatorTool": SOFTWARE, "aux:Lens": lens or metadata.lens.model}),
         done=attributes(done),
-        words="".join(
-            f"<rdf:li>{escape(word.translate(_CHARACTERS))}</rdf:li>" for word in metadata.keywords
-        ),
     )
     return packet.encode()
 
@@ -410,14 +366,14 @@ def written_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Va
     exif: dict[int, Value | Written] = {
         0x829A: (RATIONAL, metadata.exposure_s),
         0x829D: (RATIONAL, metadata.aperture),
-        0x8827: (SHORT, iso and min(round(iso), 65535)),
-        0x9000: (UNDEFINED, b"0232"),  # ExifVersion
+        0x8827: (tiff.SHORT, iso and min(round(iso), 65535)),
+        0x9000: (tiff.UNDEFINED, b"0232"),  # ExifVersion
         0x9003: taken_at,
         0x9206: (RATIONAL, metadata.focus_m),
         0x920A: (RATIONAL, metadata.focal_mm),
         0xA20E: per_cm,  # FocalPlaneXResolution
         0xA20F: per_cm,
-        0xA210: (SHORT, pitch and 3),  # per centimetre
+        0xA210: (tiff.SHORT, pitch and 3),  # per centimetre
         0xA431: (ASCII, metadata.body_serial),
         0xA433: (ASCII, metadata.lens.maker),
         0xA434: (ASCII, metadata.lens.model),
@@ -428,12 +384,12 @@ def written_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Va
         0x010E: (ASCII, description),
         0x010F: (ASCII, metadata.camera_maker),
         0x0110: (ASCII, metadata.camera_model),
-        0x0112: (SHORT, metadata.orientation),
+        0x0112: (tiff.SHORT, metadata.orientation),
         0x0131: (ASCII, SOFTWARE),
         0x0132: taken_at,
         0x013B: (ASCII, artist and artist + b"\0"),
         0x8298: (ASCII, owner and owner + b"\0"),
-        EXIF: exif,
+        tiff.EXIF: exif,
     }
 
 
@@ -443,7 +399,6 @@ def written_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Va
 # tags of GPS, of which there are 32; bytes of a value, of which honest ones have some dozen; words of XMP.
 MAX_BLOCKS, MAX_TAGS, MAX_VALUE, MAX_WORDS = 64, 64, 1 << 16, 1000
 
-_WIDTHS: Final = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 7: 1, 10: 4}  # type of a GPS tag -> bytes of its numbers
 _BLOCKS: Final = re.compile(rb"Exif\0\0|CMT4")  # before a TIFF structure; the latter in CR3, of GPS alone
 _VALUE: Final = rb'(?:\s*=\s*(?:"([^"<>]{0,200})"|\'([^\'<>]{0,200})\')|\s*>([^<>]{0,200})<)'
 _XMP_GPS: Final = re.compile(rb":[Gg][Pp][Ss]\w{1,40}" + _VALUE)
@@ -476,11 +431,11 @@ def find_location(buffer: Buffer) -> tuple[list[Overwrite], bool]:
     places = [(0, False), *((start, False) for name, start, _ in chunks if name == b"eXIf")]
     places += [(block.end(), block[0] == b"CMT4") for block in blocks[:MAX_BLOCKS]]
     for place, is_of_gps in places:
-        if reader := TiffReader.open(buffer, place):
-            # the chain of a structure, and what hangs on it
-            pointers = (tags.integer(GPS) for _, tags in reader.walk(SUB_DIRECTORIES, EXIF))
-            for offset in [reader.first] if is_of_gps else pointers:
-                spans += _directory(buffer, reader, offset)
+        reader = TiffReader.open(buffer, place)
+        # the chain of a structure, and what hangs on it
+        pointers = (tags.integer(tiff.GPS) for _, tags in reader.walk(tiff.SUB_DIRECTORIES, tiff.EXIF))
+        for offset in [reader.first] if is_of_gps else pointers:
+            spans += _directory(buffer, reader, offset)
     words = list(islice(_XMP_GPS.finditer(buffer), MAX_WORDS + 1))
     for match in words[:MAX_WORDS]:
         start, end = match.span(match.lastindex or 0)
@@ -494,12 +449,11 @@ def gps_directory(path: Path) -> dict[int, Value]:
     """Read the GPS directory of a photo, to be written into another file of it; empty without one."""
     with opened_header(path, Limits()) as header:
         for reader in header.tiff:
-            values = dict[int, Value]()
-            for tag, entry in reader.below(reader.directory(reader.first)[0], GPS).items():
-                width = _WIDTHS.get(entry.kind)
-                if tag < MAX_TAGS and width and 0 < entry.size <= MAX_VALUE and (raw := entry.raw()):
-                    numbers = np.frombuffer(raw, f"{entry.order}u{width}").astype(f"<u{width}")
-                    values[tag] = entry.kind, numbers.tobytes()
+            gps, values = reader.below(reader.directory(reader.first)[0], tiff.GPS), dict[int, Value]()
+            for tag, entry in gps.items():
+                numbers = gps.numbers(tag)  # of texts none
+                if tag < MAX_TAGS and entry.size <= MAX_VALUE and all(map(math.isfinite, numbers)):
+                    values[tag] = entry.kind, numbers or gps.raw(tag)
             if values:
                 return values
     return {}
@@ -511,7 +465,7 @@ def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[Over
     start = reader.base + offset
     head = bytes(buffer[start : start + 2]) if tags else b""
     count = int.from_bytes(head, "little" if reader.order == "<" else "big")
-    end = start + 2 + count * ENTRY
+    end = start + 2 + count * tiff.ENTRY
     if not 0 < count <= MAX_TAGS or end > len(buffer):
         return
     for entry in tags.values():

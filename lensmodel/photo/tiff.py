@@ -114,17 +114,16 @@ class TiffReader:
     buffer: Buffer = field(repr=False)  # the bytes; offsets count from `base`
     base: int  # where the structure starts in the buffer
     order: str  # byte order
-    first: int  # offset of the first directory from `base`
+    first: int  # offset of the first directory from `base`, 0 without one
 
     @classmethod
-    def open(cls, buffer: Buffer, base: int = 0) -> TiffReader | None:
-        """Read the header at `base`; `None` if it is no TIFF structure."""
-        head = bytes(buffer[base : base + 8])
-        order = {b"II": "<", b"MM": ">"}.get(head[:2])
-        if order is None or len(head) < 8:
-            return None
+    def open(cls, buffer: Buffer, base: int = 0) -> TiffReader:
+        """Read the header at `base`; what is no TIFF structure has no directory."""
+        head = bytes(buffer[base : base + 8]).ljust(8, b"\0")
+        order = ">" if head[:2] == b"MM" else "<"
         version, first = struct.unpack(order + "HI", head[2:])
-        return cls(buffer, base, order, first) if version in _VERSIONS else None
+        known = head[:2] in {b"II", b"MM"} and version in _VERSIONS
+        return cls(buffer, base, order, first if known else 0)
 
     def directory(self, offset: int) -> tuple[Tags, int]:
         """Read the directory at `offset` from `base`; its tags and the offset of the next, or 0."""

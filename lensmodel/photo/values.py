@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final, Literal, TypeAlias
 
+from numpy.typing import ArrayLike
+
 from lensmodel.core.errors import MetadataMissingError, TurnedPixelsError
 from lensmodel.core.types import BayerPattern, Frame, LensSettings, NoiseModel, Planes
 
@@ -31,11 +33,9 @@ SerialSource: TypeAlias = Literal["exif", "makernote", "xmp", "user", "none"]
 Transfer: TypeAlias = Literal["srgb", "linear", "icc"]
 OutputFormat: TypeAlias = Literal["tiff16", "png16", "png8", "jpeg", "tiff32", "dng"]
 ColorSpace: TypeAlias = Literal["same", "srgb", "camera-linear"]
-PlaneNoise: TypeAlias = tuple[NoiseModel, NoiseModel, NoiseModel]
+PlaneNoise: TypeAlias = tuple[NoiseModel, ...]  # of red, green and blue
 remarks_log = logging.getLogger("lensmodel.remarks")
 """Where what was left out of a photo or replaced in it is told, with the name of its file."""
-
-Matrix3: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 _PROCESSED: Final = 16.0  # noise variance of a photo without its mosaic over what its flat places show
 # Coarseness of grain above which more of it counts, and how much more at most; demosaicing has 6 to 9.
@@ -81,8 +81,6 @@ class PhotoMetadata:
     pixel_pitch_um: float | None = None  # of the pixels of this file
     artist: str | None = None
     copyright: str | None = None
-    rating: int | None = None
-    keywords: tuple[str, ...] = ()
 
     def settings(self, given: LensSettings | None = None) -> LensSettings:
         """Settings of the lens as the file says; a caller's, meant for a folder, fill what it leaves open."""
@@ -125,7 +123,7 @@ class PhotoInfo:
             )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Encoding:
     """How linear planes become a file like the one that they came from."""
 
@@ -134,8 +132,10 @@ class Encoding:
     icc: bytes | None = None  # the input's profile
     metadata: PhotoMetadata = PhotoMetadata()  # what is written into the output
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # multipliers that make grey grey; green is 1
-    to_srgb: Matrix3 | None = None  # white-balanced planes to linear sRGB; None: primaries of `icc`, or sRGB
-    xyz_to_camera: Matrix3 | None = None  # CIE XYZ (D65) to camera RGB, for DNG output
+    to_srgb: ArrayLike | None = (
+        None  # white-balanced planes to linear sRGB; None: primaries of `icc`, or sRGB
+    )
+    xyz_to_camera: ArrayLike | None = None  # CIE XYZ (D65) to camera RGB, for DNG output
     baseline_exposure: float | None = None  # stops by which a DNG asks raw converters to brighten it
     opcodes_2: bytes = b""  # what a DNG asks raw converters to do with a linear image of three colours,
     opcodes_3: bytes = b""  # and with the developed one
@@ -151,26 +151,24 @@ class LinearPhoto:
         Black 0, saturation 1, not white balanced; RAW stays in the camera's own colors.
     frame : Frame
         Size of the planes.
-    noise : tuple of three NoiseModel
-        Variance of the pixels of each plane.
+    noise, sensor_noise : tuple of three NoiseModel
+        Variance of the pixels of each plane, and, where there is a mosaic, that of the sensor itself: white,
+        unlike that of demosaiced planes, whose pixels share their neighbours' noise.
     clip : tuple of three float
         Level of each plane at which the sensor, or the file, clips.
     info : PhotoInfo
         What the file says.
     encoding : Encoding
         The way back to a file.
-    sensor_noise : tuple of NoiseModel or None
-        Noise of the sensor itself, measured on the mosaic: white, unlike that of demosaiced
-        planes, whose pixels share their neighbours' noise. `None` where there is no mosaic.
     coding_noise : NoiseModel or None
         What lossy compression adds where there is detail; `None` where there was none.
-    chroma_step : tuple of int
-        Rows and columns of pixels that share one value of chroma: (2, 2) in most JPEGs.
-    grain : tuple of float
-        How much coarser than white the noise of each plane is: see `noise.graininess`.
     cfa : BayerPattern or None
         Which pixels of each plane were measured, and not filled in by demosaicing. `None` where
         the planes are no longer on the sensor's grid, or there was no Bayer mosaic.
+    grain : tuple of float
+        How much coarser than white the noise of each plane is: see `noise.graininess`.
+    chroma_step : tuple of int
+        Rows and columns of pixels that share one value of chroma: (2, 2) in most JPEGs.
     remarks : tuple of str
         What was left out of the file or replaced in it, each a clause about "it".
     """
@@ -215,8 +213,7 @@ class LinearPhoto:
     def _noise_of(self, base: PlaneNoise, factors: Sequence[float]) -> PlaneNoise:
         """Noise of each plane times a factor, and no less than compression adds."""
         coded = self.coding_noise or NoiseModel(0.0, 0.0)
-        r, g, b = (
+        return tuple(
             NoiseModel(max(factor * n.shot, coded.shot), max(factor * n.read, coded.read))
             for n, factor in zip(base, factors, strict=True)
         )
-        return r, g, b

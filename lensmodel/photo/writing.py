@@ -10,7 +10,6 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, BinaryIO, Final, TypeAlias, get_args
 
 import imagecodecs
@@ -22,33 +21,10 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 from lensmodel.core.names import full_name
 from lensmodel.core.types import BayerPattern, Planes
-from lensmodel.photo.colour import (
-    D65_TO_D50,
-    SRGB_TO_XYZ_D65,
-    Curve,
-    Matrix,
-    curves_of,
-    encode,
-    icc_space,
-    inverse,
-    linear_profile,
-    matrix_profile,
-    named_profile,
-)
+from lensmodel.photo import colour, tiff
+from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, Curve, Matrix
 from lensmodel.photo.metadata import written_tags, xmp_packet
-from lensmodel.photo.tiff import (
-    ASCII,
-    BYTE,
-    GPS,
-    LONG,
-    RATIONAL,
-    SHORT,
-    SRATIONAL,
-    UNDEFINED,
-    Written,
-    laid_out,
-    write_strip,
-)
+from lensmodel.photo.tiff import LONG, SHORT, Written
 from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, PhotoMetadata, remarks_log
 
 _ROWS: Final = 256  # rows that are encoded at a time: bounds the memory of the conversion
@@ -59,7 +35,7 @@ _PNG_OPTIONS: Final = {"level": 2, "strategy": 3, "filter": 128}
 # XMP specification, part 3; ICC.1:2022, annex B.4; DNG 1.6, chapter 6.
 _XMP_TAG, _ICC_TAG, OPCODES_2, OPCODES_3 = 700, 34675, 51009, 51022
 
-_NOWHERE: Final[Written] = MappingProxyType({})
+_FROM_SRGB: Final = D65_TO_D50 @ SRGB_TO_XYZ_D65  # to XYZ under D50
 
 Pixels: TypeAlias = NDArray[Any]
 """Numbers of a file, `(row, col, channel)`, uint8 or uint16."""
@@ -75,7 +51,7 @@ def write_image(
     quality: int = 95,
     description: str = "",
     lens: str = "",
-    gps: Written = _NOWHERE,
+    gps: Written | None = None,
 ) -> None:
     """Write planes as a file that shows the picture as its input did, complete or not at all.
 
@@ -97,31 +73,29 @@ def write_image(
     path, metadata = Path(path), encoding.metadata.without_serials()
     if format.startswith("png"):
         metadata = replace(metadata, orientation=1)
-    tags = {**written_tags(metadata, description), GPS: gps}
+    tags = {**written_tags(metadata, description), tiff.GPS: gps or {}}
     xmp = xmp_packet(metadata, description, lens)
     _tell_losses(path.name, planes, encoding, format)
     linear = format == "tiff32" and color_space == "same" and encoding.transfer == "linear"
     target = _target(encoding, "camera-linear" if linear or format == "dng" else color_space)
     pixels = _encoded(planes, target, {"tiff32": None, "jpeg": 255, "png8": 255}.get(format, 65535))
     with atomic(path) as file:
-        if format == "dng":
-            write_strip(file, {**tags, **_linear_dng_tags(encoding), _XMP_TAG: (BYTE, xmp)}, pixels)
-        elif format == "jpeg":
-            exif = b"Exif\0\0" + laid_out(tags)
+        if format == "jpeg":
+            exif = b"Exif\0\0" + tiff.laid_out(tags)
             options: dict[str, Any] = {"quality": quality, "subsampling": 0, "optimize": True}
             Image.fromarray(pixels).save(file, "JPEG", icc_profile=target.icc, exif=exif, xmp=xmp, **options)
         elif format.startswith("png"):
             chunks = {
                 b"iCCP": b"ICC\0\0" + zlib.compress(target.icc),
-                b"eXIf": laid_out(tags),
+                b"eXIf": tiff.laid_out(tags),
                 b"iTXt": b"XML:com.adobe.xmp\0\0\0\0\0" + xmp,
             }
             _write_png(file, upright(pixels, encoding.metadata.orientation), chunks)
         else:
-            sample_format = 1 if format == "tiff16" else 3  # whole numbers, or floating-point
-            of_rgb: Written = {262: (SHORT, 2), 339: (SHORT, [sample_format] * 3)}
-            blocks: Written = {_XMP_TAG: (BYTE, xmp), _ICC_TAG: (UNDEFINED, target.icc)}
-            write_strip(file, {**tags, **of_rgb, **blocks}, pixels)
+            numbers = SHORT, [3 if format == "tiff32" else 1] * 3  # SampleFormat: floating-point, or whole
+            of_rgb: Written = {262: (SHORT, 2), 339: numbers, _ICC_TAG: (tiff.UNDEFINED, target.icc)}
+            tags |= _linear_dng_tags(encoding) if format == "dng" else of_rgb
+            tiff.write_strip(file, {**tags, _XMP_TAG: (tiff.BYTE, xmp)}, pixels)
 
 
 def _tell_losses(name: str, planes: Planes, encoding: Encoding, output: OutputFormat) -> None:
@@ -142,42 +116,35 @@ def _tell_losses(name: str, planes: Planes, encoding: Encoding, output: OutputFo
 class _Target:
     """How linear planes become the numbers of the file: gain, matrix, curve, and the profile that says so."""
 
-    gain: tuple[float, float, float]
-    matrix: Matrix | None
-    curves: tuple[Curve, Curve, Curve] | None  # None: the numbers are light
     icc: bytes
+    curves: tuple[Curve, Curve, Curve] | None = None  # None: the numbers are light
+    gain: Sequence[float] = (1.0, 1.0, 1.0)
+    matrix: Matrix | None = None
 
 
 def _target(encoding: Encoding, color_space: ColorSpace) -> _Target:
     if color_space == "camera-linear":
-        profile = linear_profile(_to_xyz_d50(encoding), "lensmodel linear")
-        return _Target((1.0, 1.0, 1.0), None, None, profile)
-    icc = _rgb_profile(encoding)
-    if encoding.to_srgb is None and icc is not None and color_space == "same":
-        return _Target((1.0, 1.0, 1.0), None, curves_of(encoding.transfer, icc), icc)
+        return _Target(colour.linear_profile(_to_xyz_d50(encoding)))
+    icc, balance = encoding.icc, encoding.white_balance
+    if encoding.to_srgb is None and icc is not None and icc[16:20] == b"RGB " and color_space == "same":
+        return _Target(icc, colour.curves_of(encoding.transfer, icc))
     # White must stay white: where all channels clip, no multiplier may be below 1.
-    r, g, b = (float(w) / min(encoding.white_balance) for w in encoding.white_balance)
-    return _Target((r, g, b), _to_srgb(encoding), curves_of("srgb"), named_profile("srgb"))
-
-
-def _rgb_profile(encoding: Encoding) -> bytes | None:
-    return encoding.icc if encoding.icc is not None and icc_space(encoding.icc) == "RGB" else None
+    gain = [float(weight) / min(balance) for weight in balance]
+    return _Target(colour.named_profile("srgb"), colour.curves_of("srgb"), gain, _to_srgb(encoding))
 
 
 def _to_srgb(encoding: Encoding) -> Matrix | None:
     if encoding.to_srgb is not None:
         return np.asarray(encoding.to_srgb)
-    icc = _rgb_profile(encoding)
-    profile = None if icc is None else matrix_profile(icc)
-    return None if profile is None else np.linalg.inv(D65_TO_D50 @ SRGB_TO_XYZ_D65) @ profile.to_xyz
+    profile = colour.read_profile(encoding.icc)
+    return None if profile is None or profile.to_xyz is None else np.linalg.inv(_FROM_SRGB) @ profile.to_xyz
 
 
 def _to_xyz_d50(encoding: Encoding) -> Matrix:
     """Planes to XYZ under D50, white balance included."""
     to_srgb = _to_srgb(encoding)
-    balanced = D65_TO_D50 @ SRGB_TO_XYZ_D65 @ (np.eye(3) if to_srgb is None else to_srgb)
-    matrix: Matrix = balanced * np.asarray(encoding.white_balance)
-    return matrix
+    matrix: Matrix = _FROM_SRGB if to_srgb is None else _FROM_SRGB @ to_srgb
+    return matrix * np.asarray(encoding.white_balance)
 
 
 def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
@@ -185,7 +152,7 @@ def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
     _, height, width = planes.shape
     kind = {255: np.uint8, 65535: np.uint16, None: np.float32}[top]
     out: Pixels = np.empty((height, width, 3), dtype=kind)
-    tables = None if target.curves is None else [inverse(curve) for curve in target.curves]
+    tables = None if target.curves is None else [colour.inverse(curve) for curve in target.curves]
     gain = np.asarray(target.gain, dtype=np.float32)[:, None, None]
     for row in range(0, height, _ROWS):
         part = planes[:, row : row + _ROWS] * gain
@@ -194,7 +161,7 @@ def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
         if target.matrix is not None:
             part = np.tensordot(target.matrix.astype(np.float32), part, axes=1)
         for k, light in enumerate(part):
-            numbers = light if tables is None else encode(light, tables[k])
+            numbers = light if tables is None else colour.encode(light, tables[k])
             if top is None:  # as `decode` takes them
                 numbers = np.where((light < 0.0) | (light > 1.0), light, numbers)
             else:
@@ -207,19 +174,19 @@ def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
 
 
 def _linear_dng_tags(encoding: Encoding) -> Written:
-    to_camera: ArrayLike | None = encoding.xyz_to_camera
+    to_camera = encoding.xyz_to_camera
     if to_camera is None:
         # To XYZ under D50, and back from D65, which is what the DNG tag means.
         to_camera = np.linalg.inv(np.linalg.inv(D65_TO_D50) @ _to_xyz_d50(encoding))
-    neutral = tuple(1.0 / balance for balance in encoding.white_balance)
+    neutral = [1.0 / balance for balance in encoding.white_balance]
     return {
         **dng_tags(encoding.metadata.without_serials(), to_camera, neutral, encoding.baseline_exposure),
         262: (SHORT, 34892),  # PhotometricInterpretation: linear RAW
         # LibRaw 0.22 takes a black level of linear images off the values but not off the white level
         50714: (SHORT, (0, 0, 0)),
         50717: (SHORT, (65535, 65535, 65535)),
-        OPCODES_2: (UNDEFINED, encoding.opcodes_2),
-        OPCODES_3: (UNDEFINED, encoding.opcodes_3),
+        OPCODES_2: (tiff.UNDEFINED, encoding.opcodes_2),
+        OPCODES_3: (tiff.UNDEFINED, encoding.opcodes_3),
     }
 
 
@@ -272,14 +239,14 @@ def write_bayer_dng(
         **dng_tags(metadata, color_matrix, as_shot_neutral, baseline_exposure),
         262: (SHORT, 32803),  # PhotometricInterpretation: a colour filter array (TIFF/EP)
         33421: (SHORT, (2, 2)),  # CFARepeatPatternDim
-        33422: (BYTE, bytes("RGB".index(letter) for letter in pattern)),  # CFAPattern
-        50710: (BYTE, b"\x00\x01\x02"),  # CFAPlaneColor: red, green, blue
+        33422: (tiff.BYTE, bytes("RGB".index(letter) for letter in pattern)),  # CFAPattern
+        50710: (tiff.BYTE, b"\x00\x01\x02"),  # CFAPlaneColor: red, green, blue
         50711: (SHORT, 1),  # CFALayout: rectangular
         50714: (SHORT, black),
         50717: (SHORT, white),
     }
     with atomic(Path(path)) as file:
-        write_strip(file, tags, mosaic)
+        tiff.write_strip(file, tags, mosaic)
 
 
 def dng_tags(
@@ -293,14 +260,14 @@ def dng_tags(
     unique = full_name(metadata.camera_maker, metadata.camera_model) or "Unknown"
     return {
         254: (LONG, 0),  # NewSubfileType: the full image
-        50706: (BYTE, bytes((1, 4, 0, 0))),  # DNGVersion
-        50707: (BYTE, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
-        50708: (ASCII, unique),  # UniqueCameraModel
+        50706: (tiff.BYTE, bytes((1, 4, 0, 0))),  # DNGVersion
+        50707: (tiff.BYTE, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
+        50708: (tiff.ASCII, unique),  # UniqueCameraModel
         50713: (SHORT, (1, 1)),  # BlackLevelRepeatDim
-        50721: (SRATIONAL, np.ravel(color_matrix).tolist()),  # ColorMatrix1
-        50728: (RATIONAL, np.ravel(as_shot_neutral).tolist()),
-        50730: (SRATIONAL, baseline_exposure),
-        50735: (ASCII, metadata.body_serial),  # CameraSerialNumber
+        50721: (tiff.SRATIONAL, np.ravel(color_matrix).tolist()),  # ColorMatrix1
+        50728: (tiff.RATIONAL, np.ravel(as_shot_neutral).tolist()),
+        50730: (tiff.SRATIONAL, baseline_exposure),
+        50735: (tiff.ASCII, metadata.body_serial),  # CameraSerialNumber
         50778: (SHORT, 21),  # CalibrationIlluminant1: D65, in the numbers of Exif's LightSource
     }
 

@@ -29,7 +29,7 @@ from lensmodel.core.errors import (
     UnreadablePhotoError,
     UnsupportedFormatError,
 )
-from lensmodel.photo.colour import matrix_profile, named_profile
+from lensmodel.photo.colour import named_profile, read_profile
 from lensmodel.photo.mosaic import require_known_mosaic
 from lensmodel.photo.tiff import BYTE, LONG, SHORT, Tag, Tags, laid_out
 from lensmodel.photo.writing import write_bayer_dng
@@ -204,11 +204,11 @@ def test_what_stands_beside_a_jpeg_costs_nothing_while_it_is_decoded(case: str, 
 
 
 @pytest.mark.parametrize("mode", ["RGB", "L", "P", "1"])
-@pytest.mark.parametrize("beside", [b"iCCP", b"zTXt", b"gAMA"])
+@pytest.mark.parametrize("beside", [b"iCCP", b"zTXt", b"tIME"])
 def test_what_stands_beside_a_png_is_not_unpacked_to_decode_it(
     mode: str, beside: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    body = b"" if beside == b"gAMA" else b"x\0\0" + zlib.compress(bytes(12 << 20))
+    body = b"" if beside == b"tIME" else b"x\0\0" + zlib.compress(bytes(12 << 20))
     (tmp_path / "x.png").write_bytes(png_with(chunk(beside, body), mode=mode))
 
     shown = numbers(tmp_path / "x.png")
@@ -251,9 +251,10 @@ def parts_of(profile: bytes, marks: list[tuple[int, int]]) -> bytes:
 
 def is_adobe_rgb(icc: bytes | None) -> bool:
     """Whether a profile has the green of Adobe RGB (1998), under D50, and its exponent."""
-    known = matrix_profile(icc or b"")
+    known = read_profile(icc)
     return (
         known is not None
+        and known.to_xyz is not None
         and known.to_xyz[:, 1] == pytest.approx([0.2053, 0.6257, 0.0609], abs=2e-3)
         and known.curves[1][32768] == pytest.approx(0.5**2.2, abs=2e-3)
     )
@@ -294,10 +295,8 @@ def test_a_profile_goes_before_what_else_is_declared(tmp_path: Path) -> None:
         chunk(b"cICP", bytes((1, 13, 0, 1))),
         chunk(b"sRGB", b"\0") + gama(1.0),
         gama(0.45455) + chrm(0.3127, 0.3290, 0.64, 0.33, 0.30, 0.60, 0.15, 0.06),
-        gama(0.45),
-        gama(0.0) + chrm(*(0.0,) * 8),
     ],
-    ids=["cICP", "sRGB before gAMA", "as sRGB is approximated", "rounded", "nonsense"],
+    ids=["cICP", "sRGB before gAMA", "as sRGB is approximated"],
 )
 def test_a_png_that_declares_srgb_is_read(chunks: bytes, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_bytes(png_with(chunks))

@@ -273,7 +273,7 @@ def test_only_the_first_picture_of_a_stereo_jpeg_is_the_photo(tmp_path: Path) ->
 def test_the_curve_of_an_icc_profile_is_used_and_its_primaries_are_kept(tmp_path: Path, linear: bool) -> None:
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     if linear:
-        profile = linear_profile(D65_TO_D50 @ SRGB_TO_XYZ_D65, "linear")
+        profile = linear_profile(D65_TO_D50 @ SRGB_TO_XYZ_D65)
     pixels = np.random.default_rng(0).integers(0, 65535, (40, 60, 3), dtype=np.uint16)
     developed = photo.develop(save(tmp_path, "tiff", pixels, photometric="rgb", iccprofile=profile))
 

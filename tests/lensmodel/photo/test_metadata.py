@@ -78,7 +78,6 @@ def metadata_of(tmp_path: Path) -> Read:
         ({}, {}, {}),
         ({}, {0x829D: IFDRational(0, 1), 0x920A: IFDRational(0, 1), 0x8827: 0}, {}),
         ({}, {0x829D: IFDRational(28, 0)}, {}),
-        ({}, {0x9202: IFDRational(3, 1)}, {"aperture": 2.8}),  # APEX
         ({}, {0x9206: IFDRational(0xFFFFFFFF, 1)}, {"focus_m": math.inf}),
         ({0x0112: 77}, {}, {}),
     ],

@@ -29,7 +29,7 @@ from PIL.TiffImagePlugin import IFDRational
 from lab.images import to_srgb
 from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, matrix3, srgb_to_linear
+from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
 from lensmodel.photo.metadata import gps_directory, xmp_packet
 from lensmodel.photo.writing import XYZ_TO_SRGB, opcodes_of_planes, write_bayer_dng
 
@@ -132,7 +132,7 @@ def test_white_balance_and_matrix_make_a_raw_photo_srgb_and_what_is_saturated_wh
 def test_a_wide_gamut_is_converted_when_srgb_is_asked_for(tmp_path: Path) -> None:
     # Primaries of Adobe RGB (1998) under D50, as its profile gives them.
     adobe = np.array([[0.60974, 0.20528, 0.14919], [0.31111, 0.62567, 0.06322], [0.01947, 0.06087, 0.74457]])
-    encoding = replace(PLAIN, transfer="icc", icc=linear_profile(adobe, "wide"))
+    encoding = replace(PLAIN, transfer="icc", icc=linear_profile(adobe))
     green = (
         np.zeros((3, 32, 32), dtype=np.float32) + np.array([0.2, 0.5, 0.3], dtype=np.float32)[:, None, None]
     )
@@ -337,15 +337,10 @@ def test_the_xmp_packet_says_what_was_done_and_which_lens_it_was(
 
 
 def test_a_packet_of_names_that_xml_cannot_write_is_still_xml() -> None:
-    strange = replace(PLAIN.metadata, keywords=("X\x01T\x1f-3 <&\ufffe>",))
-
-    packet = ET.fromstring(xmp_packet(strange, "done\x0b", "x\x02"))
+    packet = ET.fromstring(xmp_packet(PLAIN.metadata, "done\x0b", "X\x01T\x1f-3 <&\ufffe>"))
 
     described = next(packet.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"))
-    assert described.get("{http://ns.adobe.com/exif/1.0/aux/}Lens") == "x "
-    assert [item.text for item in packet.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}li")][1:] == [
-        "X T -3 <& >"
-    ]
+    assert described.get("{http://ns.adobe.com/exif/1.0/aux/}Lens") == "X T -3 <& >"
 
 
 # --- DNG of a mosaic ----------------------------------------------------------------------------
@@ -369,7 +364,7 @@ def test_colours_come_out_as_the_matrix_and_the_neutral_say(tmp_path: Path) -> N
     balance = np.array([2.0, 1.0, 1.6])
     colour = np.array([0.6, 0.3, 0.1])
     planes = np.broadcast_to((colour / balance)[:, None, None], (3, 32, 48))
-    to_camera = matrix3(np.asarray(XYZ_TO_SRGB) / balance[:, None])
+    to_camera = XYZ_TO_SRGB / balance[:, None]
     encoding = photo.Encoding(white_balance=tuple(balance), xyz_to_camera=to_camera)
     photo.write_image(tmp_path / "c.dng", planes, encoding, format="dng")
 
@@ -430,15 +425,13 @@ def test_files_are_as_private_as_their_writer_asks(tmp_path: Path) -> None:
     assert (tmp_path / "x.dng").stat().st_mode & 0o777 == 0o600
 
 
-# --- what a photo carries beside its pixels: rights, rating, opcodes, place ---------------------------
+# --- what a photo carries beside its pixels: rights, opcodes, place ------------------------------------
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-<rdf:Description xmlns:dc="http://purl.org/dc/elements/1.1/" xmlns:xmp="http://ns.adobe.com/xap/1.0/"
-xmp:Rating="{rating}">
+<rdf:Description xmlns:dc="http://purl.org/dc/elements/1.1/">
 <dc:rights><rdf:Alt><rdf:li xml:lang="x-default">© Ä. Example</rdf:li></rdf:Alt></dc:rights>
-<dc:creator><rdf:Seq><rdf:li>Ä. Example</rdf:li><rdf:li>B. Example</rdf:li></rdf:Seq></dc:creator>
-<dc:subject><rdf:Bag><rdf:li>holiday</rdf:li><rdf:li>café &amp; sea</rdf:li></rdf:Bag></dc:subject>
+<dc:creator><rdf:Seq><rdf:li>Ä. Example</rdf:li></rdf:Seq></dc:creator>
 </rdf:Description></rdf:RDF></x:xmpmeta>"""
 
 
@@ -449,18 +442,14 @@ def corrected(source: Path, target: Path, output: photo.OutputFormat, **options:
     return target
 
 
-@pytest.mark.parametrize("rating", [-1, 0, 4])
 @pytest.mark.parametrize("output", [*FORMATS, "tiff32"])
-def test_rights_authors_rating_and_keywords_of_xmp_are_kept(
-    output: photo.OutputFormat, rating: int, tmp_path: Path
-) -> None:
+def test_copyright_and_artist_of_xmp_are_kept(output: photo.OutputFormat, tmp_path: Path) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "x.jpg", xmp=XMP.format(rating=rating).encode())
+    Image.fromarray(pixels).save(tmp_path / "x.jpg", xmp=XMP.encode())
 
     said = photo.inspect(corrected(tmp_path / "x.jpg", tmp_path / "out", output)).metadata
 
-    assert (said.copyright, said.artist, said.rating) == ("© Ä. Example", "Ä. Example, B. Example", rating)
-    assert said.keywords == ("holiday", "café & sea")
+    assert (said.copyright, said.artist) == ("© Ä. Example", "Ä. Example")
 
 
 @pytest.mark.parametrize("output", [*FORMATS, "tiff32"])
@@ -479,7 +468,7 @@ def test_the_place_is_kept_where_its_owner_wants_it_and_nowhere_else(
 
     found = gps_directory(kept)
     assert found == gps_directory(tmp_path / "x.jpg")
-    assert found[2] == (5, struct.pack("<6I", 52, 1, 30, 1, 617, 50))
+    assert found[2] == (5, (52.0, 30.0, 12.34))
     assert gps_directory(left) == {}
 
 

@@ -1,33 +1,30 @@
 """What all ways of measuring share: `Measurer`, windows of a photo, and the PSF of one (`solve`).
 
-It is found by weighted least squares against the sharp picture that the window shows.
-
-For the pixels p that the sensor measured in a window,
+It is found by weighted least squares against the sharp picture that the window shows. For the pixels p that
+the sensor measured in a window,
 
     y(p) = sum_t k(t) x(p - t) + sum_j c_j q_j(p) + n(p)          var n(p) = s(p)²
 
 so that only the latent picture x must be known everywhere, and a mosaic needs no demosaicing. The q_j, terms
 of a quadratic, are slow changes of light over the blurred picture; the c_j are eliminated (R. Frisch and F.
-Waugh, Econometrica 1, 1933). In a window hardly wider than the kernel a quadratic takes its wings as well:
-there, a constant (`even`). Every value of the kernel has a normal prior of mean 0, whose width falls with the
-distance d to the middle as the light of a lens does,  t(d) = T / (1 + (d / D)²).  The kernel is the minimum
-of
+Waugh, Econometrica 1, 1933). In a stack of windows, hardly wider than the kernel, a quadratic would take its
+wings as well: there, a constant. Every value of the kernel has a normal prior of mean 0, whose width falls
+with the distance d to the middle as the light of a lens does,  t(d) = T / (1 + (d / D)²).  Minimal is
 
     sum_p (y - k * x - c)² / (q s²) + sum_t k(t)² / t(d)²
 
 over all k >= 0 whose sum is that of the minimum over all k, where q is the mean of the squared residuals over
 what the noise explains, below 1 only where that is overstated, as it is of a scene without a flat place.
-Without the sum, k >= 0 alone would cut off one half of the noise and keep the other: hundreds of values
-around a small core then add up to a halo that is not there. Its expected error is
+Without the sum, k >= 0 would cut off one half of the noise and keep the other: hundreds of values around a
+small core then add up to a halo that is not there. Its expected error e is
 e² = trace (X'X / q + diag(1 / t²))^-1 / |k|².
 
 A kernel that changes within the window (`varying`) is linear in the place, k + u k_u + v k_v with u and v
 from -1 to 1 over its rows and columns; k_u and k_v are eliminated too. It is found at the phase between
-pixels that fits best: a kernel that is not negative on one grid of pixels is so on no other, if it has a peak
-as narrow as a pixel. Moved by half a pixel, the peak rings along its row and column, and k >= 0 cuts one half
-of that off. So X S(d) k is compared with y, where S(d) moves a kernel by d pixels (by sinc, exact for a
-picture without frequencies beyond the pixels'), and d minimises the misfit. Where the kernel is smooth, any d
-will do, and a weak prior keeps its centre of mass in the middle.
+pixels that fits best: with a peak as narrow as a pixel it is not negative on one grid of pixels alone; moved
+by half a pixel, it rings, and k >= 0 cuts one half of that off. So X S(d) k is compared with y, where S(d)
+moves a kernel by d pixels (by sinc, exact for a picture without frequencies beyond the pixels'), and d
+minimises the misfit. A weak prior keeps the centre of mass of a smooth kernel in the middle.
 
 Sources: N. Joshi et al., "PSF estimation using sharp edge prediction", CVPR 2008, section 4 (known sharp
 picture, non-negative least squares); M. Delbracio et al., IJCV 96, 2012, section 3.
@@ -40,6 +37,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -138,16 +136,11 @@ class Measurer(ABC):
 # --- the kernel of a window ------------------------------------------------------------------------
 
 
-def quadratic(r: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Terms 1, r, c, r², rc, c² of a smooth change of light, last axis."""
-    r, c = np.broadcast_arrays(r, c)
+def window_terms(side: int, margin: int = 0) -> NDArray[np.float64]:
+    """Terms 1, r, c, r², rc, c² of a smooth change of light, last axis; r and c are -1 to 1 in a window."""
+    t = np.arange(-margin, side + margin) * 2.0 / (side - 1) - 1.0
+    r, c = np.meshgrid(t, t, indexing="ij")
     return np.stack([np.ones_like(r), r, c, r * r, r * c, c * c], axis=-1)
-
-
-def window_terms(side: int, margin: int) -> NDArray[np.float64]:
-    """Terms of `quadratic` in sides of a window from its middle, with a margin around it."""
-    t = (np.arange(-margin, side + margin) - (side - 1) / 2.0) / side
-    return quadratic(t[:, None], t[None, :])
 
 
 PEAK: Final = 0.5  # T: so much light has the middle of the sharpest kernel, a pixel and some diffraction
@@ -185,18 +178,18 @@ def solve(
     variance: NDArray[np.floating],
     size: int,
     *,
-    even: bool = False,
     varying: bool = False,
 ) -> Solved:
     """Find the kernel of odd side `size` that makes the latent picture the observed one.
 
-    The latent picture has a margin of half a kernel. A kernel that may be `varying` needs no centring.
+    Windows are `(side, side)`, or `(n, side, side)` to share a kernel; the latent picture has a margin of
+    half a kernel. A kernel that may be `varying` needs no centring.
     """
     n, count = size * size, int(measured.sum())
     if count < n:
         raise NotEnoughEvidenceError(f"{count} pixels count, {n} are needed for a kernel of side {size}")
     weight = np.where(measured, 1.0 / np.maximum(variance, 1e-12), 0.0)
-    whole = _gram(observed, latent, weight, size, even=even, varying=varying)
+    whole = _gram(observed, latent, weight, size, varying=varying)
     t = np.arange(size) - size // 2
     prior = ((1.0 + (t[:, None] ** 2 + t**2) / REACH**2) / PEAK).ravel() ** 2  # 1 / t(d)²
     k, misfit, moved = np.zeros(n), 1.0, np.zeros(2)
@@ -210,28 +203,20 @@ def solve(
         gram = _of_kernel(whole, misfit, prior)
     if varying:
         k, moved = _on_its_grid(gram, prior, k, size)
-    light = float(k.sum())
-    if not light > 0.0:
-        raise NotEnoughEvidenceError(_NO_KERNEL)
-    kernel = as_kernel(k.reshape(size, size))
+    try:
+        kernel = as_kernel(k.reshape(size, size))
+        posterior = scipy.linalg.inv(gram[:n, :n] + np.diag(prior), check_finite=False)
+    except (InvalidInputError, scipy.linalg.LinAlgError) as error:
+        raise NotEnoughEvidenceError(_NO_KERNEL) from error
     row, col = np.add(centroid(kernel), moved)
     # root of the posterior variance of all values over the norm of the kernel; 1 is the worst
-    try:
-        posterior = scipy.linalg.inv(gram[:n, :n] + np.diag(prior), check_finite=False)
-    except scipy.linalg.LinAlgError as error:
-        raise NotEnoughEvidenceError(_NO_KERNEL) from error
     spread = float(np.maximum(np.diag(posterior), 0.0).sum())
-    return Solved(kernel, light, (float(row), float(col)), min(math.sqrt(spread / float(k @ k)), 1.0))
+    relative = min(math.sqrt(spread / float(k @ k)), 1.0)
+    return Solved(kernel, float(k.sum()), (float(row), float(col)), relative)
 
 
 def _gram(
-    observed: NDArray[np.floating],
-    latent: NDArray[np.floating],
-    weight: _Floats,
-    size: int,
-    *,
-    even: bool,
-    varying: bool,
+    observed: NDArray[np.floating], latent: NDArray[np.floating], weight: _Floats, size: int, *, varying: bool
 ) -> _Floats:
     """Weighted products of all columns: those of k, or of k, k_u and k_v, less slow changes of light, and y.
 
@@ -240,16 +225,15 @@ def _gram(
     # a constant is one of the slow changes; without it single precision holds the detail
     latent = np.asarray(latent - latent.mean(), dtype=np.float32)
     observed = np.asarray(observed - observed[weight > 0].mean(), dtype=np.float32)
-    views = sliding_window_view(latent, (size, size))[:, :, ::-1, ::-1]
-    u, v = (np.linspace(-1.0, 1.0, n) for n in weight.shape)
-    terms = quadratic(u[:, None], v[None, :]).astype(np.float32)
-    rows, cols = np.nonzero(weight)
+    views = sliding_window_view(latent, (size, size), axis=(-2, -1))[..., ::-1, ::-1]
+    terms = window_terms(weight.shape[-1]).astype(np.float32)
+    pixels = np.nonzero(weight)
     kept = (3 if varying else 1) * size * size + 1
-    of_light = 1 if even else terms.shape[-1]
+    of_light = terms.shape[-1] if weight.ndim == 2 else 1
     gram = np.zeros((kept + of_light,) * 2)
-    for first in range(0, rows.size, _ROWS):
-        part = rows[first : first + _ROWS], cols[first : first + _ROWS]
-        x, slow = views[part].reshape(part[0].size, -1), terms[part]
+    for first in range(0, pixels[0].size, _ROWS):
+        part = tuple(axis[first : first + _ROWS] for axis in pixels)
+        x, slow = views[part].reshape(-1, size * size), terms[part[-2:]]
         moving = [x * slow[:, 1:2], x * slow[:, 2:3]] if varying else []
         columns = np.concatenate([x, *moving, observed[part][:, None], slow[:, :of_light]], axis=1)
         columns *= np.sqrt(weight[part]).astype(np.float32)[:, None]
@@ -284,14 +268,8 @@ def _bounded(a: _Floats, b: _Floats, start: _Floats) -> _Floats:
 
 def _of_sum(a: _Floats, b: _Floats, start: _Floats, light: float, largest: float, steps: int) -> _Floats:
     """Minimise k'Ak/2 - b'k over k >= 0 of a sum; `largest` bounds the eigenvalues of A."""
-    return fista(
-        lambda k: a @ k - b,
-        start,
-        1.0 / largest,
-        lambda k: on_simplex(k, light),
-        steps=steps,
-        still=_STILL * light,
-    )
+    project, still = partial(on_simplex, total=light), _STILL * light
+    return fista(lambda k: a @ k - b, start, 1.0 / largest, project, steps=steps, still=still)
 
 
 def _on_its_grid(gram: _Floats, prior: _Floats, start: _Floats, size: int) -> tuple[_Floats, _Floats]:

@@ -18,7 +18,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,19 +152,11 @@ def _cell_psf(
 
 
 def _stacked(lights: _Lights, kernel: NDArray[np.float64] | None) -> Solved:
-    """Solve for the kernel of all lights at once: they stand below each other, apart by what pads them.
-
-    `kernel` is that of the round before, by which the noise of each pixel is known.
-    """
+    """Solve for the kernel of all lights at once; that of the round before tells the noise of each pixel."""
     size = lights.observed.shape[1]
-
-    def below(windows: NDArray[Any]) -> NDArray[Any]:
-        return np.pad(windows, ((0, 0), (0, size - 1), (0, 0))).reshape(-1, size)[: 1 - size]
-
     even = np.broadcast_to(lights.fluxes[:, None, None] / size**2, lights.observed.shape)
     variance = lights.variance(even if kernel is None else lights.blurred(kernel))
-    latent = lights.latent().reshape(-1, 2 * size - 1)
-    return solve(below(lights.observed), latent, below(lights.measured), below(variance), size, even=True)
+    return solve(lights.observed, lights.latent(), lights.measured, variance, size)
 
 
 def _unexplained(lights: _Lights, solved: Solved) -> float:

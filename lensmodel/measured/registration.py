@@ -28,7 +28,6 @@ DEGREE: Final = 5  # radial distortion of two coefficients, and a decentred midd
 _FEWEST_MATCHES: Final = 6  # points, twice as many as a polynomial of first order needs (chosen)
 _TRUSTED_PX: Final = 0.1  # matches so near the field of all others pass: with less, good ones go (chosen)
 CLEAR: Final = 8.0  # standard deviations of a peak: peaks of 10 000 lags of noise reach 4 to 5
-_REMEDY: Final = "photograph it flat, in focus and without anything before it"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,10 +45,11 @@ class Warp:
         y, x, below = (h[0] * r + h[1] * c + h[2] for h in self.homography)
         if not self.bend.any():
             return y / below, x / below
-        down, across = polynomial.polyval2d(*self._unit(r, c), self.bend)
+        down, across = polynomial.polyval2d(*self.unit(r, c), self.bend)
         return y / below + down, x / below + across
 
-    def _unit(self, rows: NDArray[np.float64], cols: NDArray[np.float64]) -> Places:
+    def unit(self, rows: NDArray[np.float64], cols: NDArray[np.float64]) -> Places:
+        """X and Y of the polynomial."""
         (row, col), unit = self.frame.center, self.frame.half_diagonal
         return (rows - row) / unit, (cols - col) / unit
 
@@ -58,39 +58,13 @@ class Warp:
         r, c = self(np.array([row + 0.5, row - 0.5, row, row]), np.array([col, col, col + 0.5, col - 0.5]))
         return float(np.linalg.norm([[r[0] - r[1], r[2] - r[3]], [c[0] - c[1], c[2] - c[3]]], 2))
 
-    def moved(self, pixels: NDArray[np.float64], shifts: NDArray[np.float64], degree: int) -> Warp:
-        """Bend the warp so that the reference shows up `shifts` further in the photo at `pixels`."""
-        wanted = np.stack(self(*(pixels - shifts).T), axis=-1) - np.stack(self(*pixels.T), axis=-1)
-        used = np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= degree
-        basis = polynomial.polyvander2d(*self._unit(*pixels.T), [DEGREE, DEGREE])[:, used.ravel()]
-        unit = self.scale(*self.frame.center)
-        good = np.ones(len(pixels), dtype=bool)
-        for _ in range(6):
-            if good.sum() < max(_FEWEST_MATCHES, used.sum()):
-                raise NotEnoughEvidenceError(
-                    f"only {int(good.sum())} places of the photo match the reference; {_REMEDY}"
-                )
-            terms = np.linalg.lstsq(basis[good], wanted[good], rcond=None)[0]
-            left = np.hypot(*(wanted - basis @ terms).T) / unit
-            after = left <= max(3.0 * float(np.median(left[good])), _TRUSTED_PX)
-            if (after == good).all():
-                break
-            good = after
-        bend = self.bend.copy()
-        bend[used] += terms
-        return replace(self, bend=bend)
-
 
 def homography_of(from_: NDArray[np.float64], to: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Homography through four or more pairs of points `(n, 2)`, by the direct linear transform."""
-    scale = np.abs(from_).max(), np.abs(to).max()
+    """Homography through four pairs of points `(4, 2)`."""
     rows = []
-    for (r, c), (y, x) in zip(from_ / scale[0], to / scale[1], strict=True):
-        rows.append([r, c, 1, 0, 0, 0, -y * r, -y * c, -y])
-        rows.append([0, 0, 0, r, c, 1, -x * r, -x * c, -x])
-    h = np.linalg.svd(np.asarray(rows))[2][-1].reshape(3, 3)
-    h = np.diag([scale[1], scale[1], 1.0]) @ h @ np.diag([1 / scale[0], 1 / scale[0], 1.0])
-    return np.asarray(h / h[2, 2])
+    for (r, c), (y, x) in zip(from_, to, strict=True):
+        rows += [[r, c, 1, 0, 0, 0, -y * r, -y * c], [0, 0, 0, r, c, 1, -x * r, -x * c]]
+    return np.append(np.linalg.solve(rows, to.ravel()), 1.0).reshape(3, 3)
 
 
 def match(photo: NDArray[np.floating], reference: NDArray[np.floating]) -> tuple[tuple[float, float], float]:
@@ -128,21 +102,35 @@ def matched(
     on_step: StepHook,
 ) -> Warp:
     """Bend a warp to the matches of all windows that are clear; each calls `on_step(0, 1)`."""
-    pixels, shifts = [], []
+    found = []
     for row, col in corners:
         on_step(0, 1)
         seen, shown = plane[row : row + side, col : col + side], render(warp, (row, col), (side, side))
         shift, clarity = match(seen, shown)
         if clarity >= CLEAR:
-            pixels.append((row + (side - 1) / 2.0, col + (side - 1) / 2.0))
-            shifts.append(shift)
-    if len(pixels) < _FEWEST_MATCHES:
-        raise NotEnoughEvidenceError(
-            f"only {len(pixels)} of {len(corners)} windows of the photo match the reference; {_REMEDY}"
-        )
+            found.append(((row + (side - 1) / 2.0, col + (side - 1) / 2.0), shift))
+    pixels, shifts = np.array(found).reshape(-1, 2, 2).transpose(1, 0, 2)
+    wanted = np.stack(warp(*(pixels - shifts).T), axis=-1) - np.stack(warp(*pixels.T), axis=-1)
     # two matches for each term
-    most = max(d for d in range(degree + 1) if (d + 1) * (d + 2) <= len(pixels))
-    return warp.moved(np.array(pixels), np.array(shifts), most)
+    degree = max((d for d in range(degree + 1) if (d + 1) * (d + 2) <= len(pixels)), default=0)
+    used = np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= degree
+    basis = polynomial.polyvander2d(*warp.unit(*pixels.T), [DEGREE, DEGREE])[:, used.ravel()]
+    good = np.ones(len(pixels), dtype=bool)
+    for _ in range(6):
+        if good.sum() < max(_FEWEST_MATCHES, used.sum()):
+            raise NotEnoughEvidenceError(
+                f"only {int(good.sum())} of {len(corners)} windows of the photo match the reference; "
+                "photograph it flat, in focus and without anything before it"
+            )
+        terms = np.linalg.lstsq(basis[good], wanted[good], rcond=None)[0]
+        left = np.hypot(*(wanted - basis @ terms).T) / warp.scale(*warp.frame.center)
+        after = left <= max(3.0 * float(np.median(left[good])), _TRUSTED_PX)
+        if (after == good).all():
+            break
+        good = after
+    bend = warp.bend.copy()
+    bend[used] += terms
+    return replace(warp, bend=bend)
 
 
 _LOOKED_AT: Final = 1000  # pixels along the long side: noise has turned to grey, discs are 15 across
@@ -163,14 +151,12 @@ def find_marks(plane: NDArray[np.floating]) -> NDArray[np.float64]:
     scale = max(small.shape) / _LOOKED_AT
     dark = ndimage.gaussian_filter(small, 2.0 * scale) < _DARK * ndimage.gaussian_filter(small, 40.0 * scale)
     labels, _ = ndimage.label(dark)
-    blobs = [
-        np.argwhere(labels[box] == number) + [side.start for side in box]
-        for number, box in enumerate(ndimage.find_objects(labels), start=1)
-    ]
-    discs = sorted(
-        ((_paper_over_disc(blob, small), number) for number, blob in enumerate(blobs)), reverse=True
-    )
-    clear = [blobs[number] for clarity, number in discs if clarity > _PAPER_OVER_DISC][:_CANDIDATES]
+    discs = []
+    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+        blob = np.argwhere(labels[box] == number) + [side.start for side in box]
+        if (clarity := _paper_over_disc(blob, small)) > _PAPER_OVER_DISC:
+            discs.append((clarity, blob))
+    clear = [blob for _, blob in sorted(discs, key=lambda disc: -disc[0])][:_CANDIDATES]
     best, most = None, 0.05 * small.size
     for four in combinations(clear, 4):
         areas = [len(blob) for blob in four]

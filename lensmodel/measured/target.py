@@ -396,7 +396,7 @@ def _fitted_light(window: Window, page: NDArray[np.floating], kernel: Kernel) ->
         raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
     lit = page * np.moveaxis(window_terms(side, len(kernel) // 2), -1, 0)
     terms = _explained(window, lit, kernel)[1][:6]
-    light = window_terms(side, 0) @ terms
+    light = window_terms(side) @ terms
     if not float(light.min()) > 0.0:
         raise NotEnoughEvidenceError("a window of the page is black, or does not show the page; light it")
     return np.asarray(terms / float(light.mean()))
@@ -407,5 +407,5 @@ def _explained(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Columns of blurred pages and of light laid over them at the measured pixels, and the share of each."""
     blurred = [signal.fftconvolve(page, kernel, mode="valid")[window.measured] for page in pages]
-    basis = np.column_stack([*blurred, window_terms(len(window.light), 0)[window.measured]])
+    basis = np.column_stack([*blurred, window_terms(len(window.light))[window.measured]])
     return basis, np.linalg.lstsq(basis, window.light[window.measured], rcond=None)[0]

@@ -12,7 +12,7 @@ package costs nothing. docs/library.md shows them at work.
 
 `patches` chooses patches of photos, `blind.sampling` and `measured` make samples of a PSF of them, `model`
 makes these a function of place and settings, by default with the network of `neural`, and `correction`
-applies it; `api` and `calibration` join them in a `lens`. Photos come in and go out through `photo`;
+applies it; `api` joins them in a `lens`. Photos come in and go out through `photo`;
 `quality` judges, `report` describes, `simulate` makes photos whose truth is known, `core` has what all share,
 and `cli` is the command.
 CONTRIBUTING.md says where a method is added.

@@ -87,29 +87,26 @@ class Lens:
 
         Raises
         ------
-        InvalidInputError
-            If a kernel cannot be a PSF, shapes do not fit, or another value is out of its range.
-        NoSamplesError
-            If there is no kernel, or none has a weight.
+        InvalidInputError, NoSamplesError
+            If a kernel cannot be a PSF, shapes do not fit, or another value is out of its range; or if there
+            is no kernel, or none has a weight.
         """
         stack = np.asarray(kernels, dtype=np.float64)
         if stack.ndim != 3:
             raise InvalidInputError(f"kernels must have the shape (n, k, k), got {stack.shape}")
-        n = len(stack)
-        names = ("r", "phi", "aperture", "channel", "weight", "photo")
-        given = (r, phi, aperture, channel, weight, photo)
-        columns = [_each(values, n, name) for values, name in zip(given, names, strict=True)]
+        given = {
+            "r": r,
+            "phi": phi,
+            "aperture": aperture,
+            "channel": channel,
+            "weight": weight,
+            "photo": photo,
+        }
+        columns = [_each(values, len(stack), name) for name, values in given.items()]
+        common: dict[str, Any] = {"pixel_pitch_um": pixel_pitch_um, "estimator": "given"}
         samples = [
-            PsfSample(
-                centred(kernel),
-                FieldPosition(radius, angle),
-                LensSettings(f_number, channel=color),
-                weight=sure,
-                photo=name,
-                pixel_pitch_um=pixel_pitch_um,
-                estimator="given",
-            )
-            for kernel, radius, angle, f_number, color, sure, name in zip(stack, *columns, strict=True)
+            PsfSample(centred(kernel), FieldPosition(*at), LensSettings(n, channel=c), w, name, **common)
+            for kernel, *at, n, c, w, name in zip(stack, *columns, strict=True)
         ]
         return cls(LensProfile(LensModel.fit(samples)))
 
@@ -144,11 +141,6 @@ class Lens:
         -----
         UserWarning
             If no photo shows this place at these settings.
-
-        Raises
-        ------
-        InvalidInputError
-            If a value is out of its range.
         """
         answer = self.model.query(FieldPosition(r, phi), LensSettings(**settings), size)
         if answer.extrapolated:
@@ -168,16 +160,8 @@ class Lens:
         -------
         ndarray of float64, shape (*S, size, size)
         """
-        radii, angles = np.asarray(r, dtype=np.float64), np.asarray(phi, dtype=np.float64)
-        try:
-            radii, angles = np.broadcast_arrays(radii, angles)
-        except ValueError as error:
-            raise InvalidInputError(
-                f"r and phi must have shapes that broadcast, got {radii.shape} and {angles.shape}"
-            ) from error
-        places = [
-            FieldPosition(float(a), float(b)) for a, b in zip(radii.ravel(), angles.ravel(), strict=True)
-        ]
+        radii, angles = np.broadcast_arrays(np.asarray(r, np.float64), np.asarray(phi, np.float64))
+        places = [FieldPosition(*at) for at in zip(radii.flat, angles.flat, strict=True)]
         flat = self.model.kernels(places, LensSettings(**settings), size)
         return flat.reshape(*radii.shape, size, size)
 
@@ -242,13 +226,12 @@ def _both_ways(
     kernels: NDArray[np.float64], phi: ArrayLike, measure: Callable[[NDArray[np.float64], float], Any]
 ) -> NDArray[np.float64]:
     """Measure kernels, shape (*S, k, k), along the radius and across it; shape (2, *S, ...)."""
-    angles = np.broadcast_to(np.asarray(phi, dtype=np.float64), kernels.shape[:-2])
-    measured = [
-        [measure(kernels[index], float(angles[index]) + turn) for index in np.ndindex(angles.shape)]
-        for turn in (0.0, np.pi / 2.0)
-    ]
-    values = np.array(measured, dtype=np.float64)
-    return values.reshape(2, *angles.shape, *values.shape[2:])
+    places = kernels.shape[:-2]
+    pairs = list(
+        zip(kernels.reshape(-1, *kernels.shape[-2:]), np.broadcast_to(phi, places).flat, strict=True)
+    )
+    values = np.array([[measure(kernel, at + turn) for kernel, at in pairs] for turn in (0.0, np.pi / 2.0)])
+    return values.reshape(2, *places, *values.shape[2:])
 
 
 def _each(values: ArrayLike | Sequence[str] | None, n: int, name: str) -> list[Any]:

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from lensmodel.api import AHEAD, Calibration
 from lensmodel.blind import estimators
 from lensmodel.blind.sampling import CalibrationEvent, configured
-from lensmodel.calibration import AHEAD, Calibration
 from lensmodel.cli import console, files
 from lensmodel.cli.console import Display, UsageError
 from lensmodel.core import processes

@@ -17,9 +17,8 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 import typer
 
 import lensmodel
-from lensmodel.api import FORMATS, SEEN_DB
+from lensmodel.api import FORMATS, SEEN_DB, Calibration
 from lensmodel.blind.sampling import CalibrationEvent, configured
-from lensmodel.calibration import Calibration
 from lensmodel.cli import console, files
 from lensmodel.cli.console import Display, UsageError, gain_words, reason
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from lensmodel.calibration import LensStore
+from lensmodel.api import LensStore
 from lensmodel.cli.console import UsageError, reason
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.lens import Lens

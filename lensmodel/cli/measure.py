@@ -10,8 +10,8 @@ from typing import Annotated, Any, Final, Literal
 import typer
 
 from lensmodel import measured as measuring
+from lensmodel.api import Admit, Calibration
 from lensmodel.blind.sampling import configured
-from lensmodel.calibration import Admit, Calibration
 from lensmodel.cli import console, files
 from lensmodel.cli.console import Display, UsageError
 from lensmodel.core.errors import LensModelError

@@ -17,8 +17,8 @@ import rawpy
 import lensmodel
 from lab.kernels import gaussian
 from lensmodel import photo
+from lensmodel.api import Calibration, LensStore
 from lensmodel.blind import sampling
-from lensmodel.calibration import Calibration, LensStore
 from lensmodel.core import processes
 from lensmodel.core.errors import CancelledError, InvalidInputError, MetadataMissingError
 from lensmodel.core.psf import PsfSample
@@ -44,7 +44,7 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         admit(photo.PhotoMetadata(aperture=None if path.stem == "unknown" else 2.8))
         return samples_of(key)
 
-    monkeypatch.setattr("lensmodel.calibration.samples_of_photo", estimated)
+    monkeypatch.setattr("lensmodel.blind.sampling.samples_of_photo", estimated)
     paths = [tmp_path / "a.dng", tmp_path / "b.dng"]
     for path in paths:
         path.write_bytes(path.name.encode())
@@ -167,7 +167,7 @@ def test_a_calibration_that_is_cancelled_is_no_photo_that_failed(
     def cancelled(path: Path, config: sampling.Config, **options: object) -> list[PsfSample]:
         raise CancelledError("enough")
 
-    monkeypatch.setattr("lensmodel.calibration.samples_of_photo", cancelled)
+    monkeypatch.setattr("lensmodel.blind.sampling.samples_of_photo", cancelled)
 
     with pytest.raises(CancelledError, match="enough"):
         lensmodel.calibrate(photos)

@@ -7,7 +7,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ import pytest
 
 import lensmodel
 from lab.kernels import gaussian
-from lensmodel.api import say
 from lensmodel.core import processes
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, centroid
@@ -132,11 +130,6 @@ def test_frequencies_that_no_contrast_has_are_refused(frequencies: Any, lens: Le
         lens.mtf(0.5, 0.0, frequencies)
 
 
-def test_places_whose_shapes_do_not_fit_are_refused(lens: Lens) -> None:
-    with pytest.raises(InvalidInputError, match=r"\(2,\) and \(3,\)"):
-        lens.kernels([0.1, 0.2], [0.0, 1.0, 2.0])
-
-
 # --- arrays in, arrays out; methods of one's own ----------------------------------------------
 
 
@@ -236,32 +229,6 @@ def test_a_question_outside_what_the_photos_show_warns(r: float, aperture: float
 
     with pytest.warns(UserWarning, match="is a guess"):
         lens.psf(r, 0.6, aperture=aperture)
-
-
-@pytest.mark.parametrize(
-    ("terminal", "notebook", "said"),
-    [
-        (True, False, "\r\x1b[Ka.dng: 50%\r\x1b[Ka.dng: done\n"),
-        (False, True, "a.dng: done\n"),
-        (False, False, ""),
-    ],
-)
-def test_a_terminal_shows_each_step_and_a_notebook_whole_lines(
-    terminal: bool,
-    notebook: bool,
-    said: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
-    if notebook:
-        monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
-
-    say("a.dng: 50%")
-    say("a.dng: done", stays=True)
-
-    assert capsys.readouterr().err == said
 
 
 def test_a_lens_is_shown_in_words(lens: Lens) -> None:

@@ -252,7 +252,7 @@ def test_two_runs_on_one_profile_drop_nothing_of_each_other(
         save_profile(folder / PROFILE, replace(known, photos={**known.photos, "fedcba9876543210": "y.dng"}))
         return [PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.5, 0.0), LensSettings(2.8), photo="z")]
 
-    monkeypatch.setattr("lensmodel.calibration.samples_of_photo", estimated)
+    monkeypatch.setattr("lensmodel.blind.sampling.samples_of_photo", estimated)
     done = here("calibrate", "one.dng", "-p", PROFILE, "--aperture", "8")
 
     assert done.returncode == 0, done.stderr

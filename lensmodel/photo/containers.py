@@ -9,20 +9,23 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import mmap
 import re
 import statistics
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
-from typing import Final, cast
+from typing import BinaryIO, Final, TypeAlias, cast
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL.JpegImagePlugin import JpegImageFile
 
 from lensmodel.core import errors
-from lensmodel.photo.tiff import MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, Tags, TiffReader
 from lensmodel.photo.values import FileKind, Limits
 
 HEAD_BYTES: Final = 64  # that `sniff` wants to see
@@ -31,6 +34,221 @@ BOMB_MEGAPIXELS: Final = 4.0  # below this a false claim costs nothing worth ref
 BOMB_PIXELS_PER_BYTE: Final = 200.0  # an evenly grey JPEG reaches 100, and a photograph is never evenly grey
 MAX_CHUNKS: Final = 4096  # of a PNG that are looked at; image data do not count
 MAX_HEAD_BYTES: Final = 64 << 20  # of a JPEG before its picture: phones put whole pictures there (chosen)
+
+
+# --- directories of TIFF tags: the skeleton of TIFF, DNG, EXIF and most RAW files ------------------
+#
+# Every offset is checked against the buffer, loops end, no count makes us allocate more than
+# `MAX_VALUE_BYTES`; a directory that is damaged half-way gives what came before. TIFF 6.0, section 2.
+
+Buffer: TypeAlias = bytes | mmap.mmap
+
+# Against files made to cost time or memory (chosen): entries of a directory, of which cameras write below
+# 150; directories, of which they write a dozen; and bytes of a value.
+MAX_ENTRIES, MAX_DIRECTORIES, MAX_VALUE_BYTES = 1024, 64, 16 << 20
+
+ENTRY: Final = 12  # bytes of an entry of a directory
+EXIF, GPS, SUB_DIRECTORIES = (0x8769, 0x8825, 0x014A)  # to directories: Exif 3.0, 4.6.3; TIFF/EP
+
+# Types of values, and their formats of `struct`; 13 is an offset of a directory
+BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
+_FORMATS: Final[Mapping[int, str]] = {
+    1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h",
+    9: "i", 10: "ii", 11: "f", 12: "d", 13: "I",
+}  # fmt: skip
+_SIZES: Final = {kind: struct.calcsize("=" + code) for kind, code in _FORMATS.items()}
+_VERSIONS: Final = {42, 0x55, 0x4F52, 0x5352}  # TIFF, Panasonic RW2, and two of Olympus ORF
+
+
+@dataclass(frozen=True, slots=True)
+class Tag:
+    """One tag of a directory; the value is read from the buffer when asked for."""
+
+    kind: int
+    count: int
+    offset: int
+    order: str
+    buffer: Buffer = field(repr=False)
+
+    @property
+    def size(self) -> int:
+        """Bytes that the value claims to have."""
+        return self.count * _SIZES[self.kind]
+
+    def raw(self) -> bytes:
+        """Bytes of the value; empty if it lies outside the buffer or is too large."""
+        end = self.offset + self.size
+        sound = self.offset >= 0 and self.size <= MAX_VALUE_BYTES and end <= len(self.buffer)
+        return bytes(self.buffer[self.offset : end]) if sound else b""
+
+
+class Tags(dict[int, Tag]):
+    """The tags of a directory; one that is not there gives an empty value, or `None`."""
+
+    def raw(self, tag: int) -> bytes:
+        """Bytes of a value."""
+        return self[tag].raw() if tag in self else b""
+
+    def numbers(self, tag: int, most: int = MAX_VALUE_BYTES) -> tuple[float, ...]:
+        """The first `most` values as numbers: rationals as quotients, NaN over zero; text gives none."""
+        if tag not in self or (code := _FORMATS[self[tag].kind]) == "s":
+            return ()
+        raw = self.raw(tag)[: most * _SIZES[self[tag].kind]]
+        values = struct.iter_unpack(self[tag].order + code, raw)
+        return tuple(a if not over else a / over[0] if over[0] else math.nan for a, *over in values)
+
+    def number(self, tag: int) -> float | None:
+        """The first value; `None` also where it is not finite."""
+        return next((value for value in self.numbers(tag, 1) if math.isfinite(value)), None)
+
+    def integers(self, tag: int, most: int = MAX_VALUE_BYTES) -> tuple[int, ...]:
+        """The first `most` values where they are whole numbers by their type; others give none."""
+        whole = tag in self and _FORMATS[self[tag].kind] in "BHIbhi"
+        return tuple(int(value) for value in self.numbers(tag, most)) if whole else ()
+
+    def integer(self, tag: int, default: int = 0) -> int:
+        """The first value where it is a whole number by its type."""
+        return next(iter(self.integers(tag, 1)), default)
+
+    def text(self, tag: int) -> str | None:
+        """Text up to the first NUL, stripped; bytes outside UTF-8 read as Latin-1, nothing as `None`."""
+        raw = self.raw(tag).split(b"\0", 1)[0]
+        try:
+            return raw.decode("utf-8").strip() or None
+        except UnicodeDecodeError:
+            return raw.decode("latin-1").strip() or None
+
+
+@dataclass(frozen=True, slots=True)
+class TiffReader:
+    """Directories of a TIFF structure inside a buffer."""
+
+    buffer: Buffer = field(repr=False)  # the bytes; offsets count from `base`
+    base: int  # where the structure starts in the buffer
+    order: str  # byte order
+    first: int  # offset of the first directory from `base`, 0 without one
+
+    @classmethod
+    def open(cls, buffer: Buffer, base: int = 0) -> TiffReader:
+        """Read the header at `base`; what is no TIFF structure has no directory."""
+        head = bytes(buffer[base : base + 8]).ljust(8, b"\0")
+        order = ">" if head[:2] == b"MM" else "<"
+        version, first = struct.unpack(order + "HI", head[2:])
+        known = head[:2] in {b"II", b"MM"} and version in _VERSIONS
+        return cls(buffer, base, order, first if known else 0)
+
+    def directory(self, offset: int) -> tuple[Tags, int]:
+        """Read the directory at `offset` from `base`; its tags and the offset of the next, or 0."""
+        start, tags = self.base + offset, Tags()
+        head = bytes(self.buffer[start : start + 2]) if offset > 0 and start > 0 else b""
+        if len(head) < 2:
+            return tags, 0
+        count, at = struct.unpack(self.order + "H", head)[0], start + 2
+        table = bytes(self.buffer[at : at + ENTRY * min(count, MAX_ENTRIES)])
+        entries = struct.iter_unpack(self.order + "HHII", table[: len(table) // ENTRY * ENTRY])
+        for number, kind, values, far in entries:
+            if kind in _FORMATS:
+                place = at + 8 if values * _SIZES[kind] <= 4 else self.base + far
+                tags.setdefault(number, Tag(kind, values, place, self.order, self.buffer))
+            at += ENTRY
+        tail = bytes(self.buffer[at : at + 4])
+        complete = len(table) == count * ENTRY and len(tail) == 4
+        return tags, struct.unpack(self.order + "I", tail)[0] if complete else 0
+
+    def walk(self, *pointers: int) -> Iterator[tuple[int, Tags]]:
+        """Yield place and tags of the first directory and of those that it and others point to, each once."""
+        waiting, seen = [self.first], {0}
+        while waiting and len(seen) <= MAX_DIRECTORIES:
+            offset = waiting.pop(0)
+            if offset in seen:
+                continue
+            seen.add(offset)
+            tags, following = self.directory(offset)
+            if tags:
+                yield offset, tags
+            waiting.append(following)
+            waiting += [below for tag in pointers for below in tags.integers(tag, MAX_DIRECTORIES)]
+
+    def below(self, tags: Tags, pointer: int) -> Tags:
+        """Read the directory that a tag (EXIF, GPS, part of a maker note) points to; empty without one."""
+        return self.directory(tags.integer(pointer))[0]
+
+
+Value: TypeAlias = "tuple[int, bytes | str | float | Sequence[float] | None]"
+"""Type and value of a tag to be written: text, one number or several, or their bytes, little-endian."""
+
+Written: TypeAlias = Mapping[int, "Value | Written"]
+"""Tags of a directory to be written, such as others below it; what is `None` or empty is left out."""
+
+
+def laid_out(tags: Written) -> bytes:
+    """Lay out a TIFF structure: its header, a directory, and those below it."""
+    return b"II*\0\x08\0\0\0" + _packed(tags, 8)
+
+
+def _packed(directory: Written, offset: int) -> bytes:
+    """Lay a directory out to stand at `offset` of the file; long values and those below it right behind."""
+    entries = [
+        (tag, value)
+        for tag, value in sorted(directory.items())
+        if (value if isinstance(value, Mapping) else value[1] not in (None, "", b""))
+    ]
+    position = offset + 2 + ENTRY * len(entries) + 4
+    head, tail = struct.pack("<H", len(entries)), b""
+    for tag, value in entries:
+        tail += bytes(len(tail) % 2)  # values begin on a word boundary
+        place = struct.pack("<I", position + len(tail))
+        if isinstance(value, Mapping):
+            kind, data, behind = LONG, place, _packed(value, position + len(tail))
+        else:
+            kind, data = value[0], _bytes_of(*value)
+            behind = data if len(data) > 4 else b""
+        head += struct.pack("<HHI", tag, kind, len(data) // _SIZES[kind])
+        head += place if behind else data.ljust(4, b"\0")
+        tail += behind
+    return head + bytes(4) + tail
+
+
+def _bytes_of(kind: int, value: bytes | str | float | Sequence[float] | None) -> bytes:
+    """Bytes of a value: quotients a millionth off at most, text in ASCII with question marks for the rest."""
+    if isinstance(value, bytes):
+        return value
+    if isinstance(value, str):
+        return value.encode("ascii", "replace") + b"\0"
+    numbers = [value] if isinstance(value, int | float) else [*(value or ())]
+    if kind in {RATIONAL, SRATIONAL}:
+        most, quotients = (2**32 if kind == RATIONAL else 2**31) - 1, list[float]()
+        for number in numbers:
+            finite = min(number, most)  # by which EXIF writes infinity
+            part = Fraction(finite).limit_denominator(min(1_000_000, int(most / max(abs(finite), 1.0))))
+            quotients += part.numerator, part.denominator
+        numbers = quotients
+    return struct.pack(f"<{len(numbers)}{_FORMATS[kind][0]}", *numbers)
+
+
+def write_strip(file: BinaryIO, tags: Written, pixels: NDArray[np.generic]) -> None:
+    """Write a TIFF structure and the pixels `(row, col[, channel])`, as one strip that is not compressed."""
+    height, width, samples = (*pixels.shape, 1)[:3]
+    whole: dict[int, Value | Written] = {
+        **tags,
+        256: (LONG, width),
+        257: (LONG, height),
+        258: (SHORT, [8 * pixels.dtype.itemsize] * samples),
+        259: (SHORT, 1),  # not compressed
+        273: (LONG, 0),
+        277: (SHORT, samples),
+        278: (LONG, height),
+        279: (LONG, pixels.nbytes),
+        284: (SHORT, 1),  # interleaved
+    }
+    at = len(laid_out(whole))
+    at += -at % 16
+    whole[273] = LONG, at
+    file.write(laid_out(whole).ljust(at, b"\0"))
+    file.write(np.ascontiguousarray(pixels).astype(pixels.dtype.newbyteorder("<"), copy=False).data)
+
+
+# --- files ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +265,8 @@ class Header:
     camera: tuple[str, str] | None = None  # maker and model of a CRW file, which has no TIFF structure
     xmp: bytes | None = None
     icc: bytes | None = None  # empty where there is a profile that cannot be read at all
-    # median step of the quantised cosine coefficients of luma in a JPEG, or in the tiles of a lossy DNG, in
-    # 8-bit numbers; 0 unknown, or not compressed so
-    coarseness: float = 0.0
+    # median step of the quantised cosine coefficients of luma in a JPEG or lossy DNG, in 8-bit numbers
+    coarseness: float = 0.0  # 0 unknown, or not compressed so
     chroma_step: tuple[int, int] = (1, 1)  # rows and columns that share one value of a JPEG's chroma
     whole: bool = True  # false where the file ends before its picture does
 

@@ -12,8 +12,6 @@ tables (P. Harvey), checked against files of these cameras.
 from __future__ import annotations
 
 import contextlib
-import io
-import logging
 import math
 import re
 import struct
@@ -23,17 +21,13 @@ from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
-from typing import Final, NamedTuple
-from xml.etree import ElementTree as ET
-from xml.sax.saxutils import quoteattr
+from typing import Final, TypeAlias
+from xml.sax.saxutils import quoteattr, unescape
 
 from lensmodel.core.errors import TruncatedImageError
-from lensmodel.photo import tiff
-from lensmodel.photo.containers import MAX_BLOCK_BYTES, Header, opened_header, png_chunks
-from lensmodel.photo.tiff import ASCII, RATIONAL, Buffer, Tag, Tags, TiffReader, Value, Written
+from lensmodel.photo import containers
+from lensmodel.photo.containers import ASCII, RATIONAL, Buffer, Header, Tag, Tags, TiffReader, Value, Written
 from lensmodel.photo.values import SOFTWARE, LensIdentity, Limits, PhotoMetadata, SerialSource
-
-log = logging.getLogger(__name__)
 
 _PLACEHOLDER: Final = re.compile(
     r"[0.\-_ x?]*|(.)\1{5,}|none|no lens|n/?a|unknown|null|manual", re.IGNORECASE
@@ -81,7 +75,7 @@ class Said:
             main, _ = reader.directory(reader.first)
             if header.directory:  # a preview may stand before the photo
                 main.update(reader.directory(header.directory)[0])
-            main.update(reader.below(main, tiff.EXIF))
+            main.update(reader.below(main, containers.EXIF))
             if 0x927C in main:
                 note_in = reader
             tags = Tags({**main, **tags})
@@ -285,52 +279,34 @@ def _olympus(reader: TiffReader, first: int) -> PhotoMetadata:
 
 # --- XMP ----------------------------------------------------------------------------------------
 
-MAX_XMP_BYTES: Final = 1 << 20  # against files made to fill the memory; real ones are some kilobytes
-_RDF: Final = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
-_SPACES: Final[Mapping[str, str]] = {
-    "http://ns.adobe.com/exif/1.0/aux/": "aux",
-    "http://ns.adobe.com/camera-raw-settings/1.0/": "crs",
-    "http://purl.org/dc/elements/1.1/": "dc",
-    "http://ns.adobe.com/exif/1.0/": "exif",
-    "http://cipa.jp/exif/1.0/": "exifEX",
-    "http://ns.adobe.com/tiff/1.0/": "tiff",
-    "http://ns.adobe.com/xap/1.0/": "xmp",
-    "http://ns.adobe.com/xap/1.0/mm/": "xmpMM",
-    "http://ns.adobe.com/xap/1.0/sType/ResourceEvent#": "stEvt",
-    _RDF: "rdf",
-}
+MAX_XMP_BYTES: Final = 1 << 20  # against files made to cost time; real packets are some kilobytes
+_PROPERTY: Final = re.compile(
+    rb"(?<=[<\s])((?:aux|crs|dc|exif|exifEX|tiff):\w{1,40}+)\s{0,99}+"
+    rb"(?:=\s{0,99}+\"([^\"<]{0,1024}+)\"|=\s{0,99}+'([^'<]{0,1024}+)'"
+    rb"|[^<>=]{0,99}+>(?:\s{0,99}+<rdf:[^<>]{0,200}+>){0,3}([^<]{0,1024}+)<)"
+)
+"""A property as attribute or element, under the prefix that all programs use: no entities, no recursion."""
 
 
 def read_xmp(packet: bytes | None) -> Mapping[str, str]:
-    """Read the properties of a packet by prefix and name: of a list the first.
-
-    A packet that is damaged gives what came before the damage, one with a document type, the door to entity
-    expansion, nothing: metadata that cannot be read are unknown, and no reason to refuse the photo.
-    """
-    if not packet or len(packet) > MAX_XMP_BYTES or b"<!DOCTYPE" in packet.replace(b"\0", b""):
-        return {}
-    elements, properties = list[ET.Element](), dict[str, str]()
-    try:
-        for _, element in ET.iterparse(io.BytesIO(packet.strip(b"\0 \r\n")), events=["start"]):  # noqa: S314  no entities: see above
-            elements.append(element)  # their texts come later
-    except (ET.ParseError, ValueError) as damage:
-        log.info("an XMP packet is damaged: %s", damage)
-    name = ""
-    for element in elements:
-        # The items of a list belong to the property around it: <exif:ISO><Seq><li>100.
-        name = name if element.tag.startswith("{" + _RDF) else element.tag
-        for qualified, value in [*element.items(), (name, element.text or "")]:
-            space, _, local = qualified.removeprefix("{").rpartition("}")
-            if space in _SPACES and value.strip():
-                properties.setdefault(f"{_SPACES[space]}:{local}", value.strip()[:1024])
+    """Read the properties of a packet by prefix and name: the first of a list, what is whole of damage."""
+    properties = dict[str, str]()
+    if packet and len(packet) <= MAX_XMP_BYTES and b"<!DOCTYPE" not in packet:
+        for match in _PROPERTY.finditer(packet):
+            if value := unescape(match[match.lastindex or 0].decode("utf-8", "replace"), _QUOTES).strip():
+                properties.setdefault(match[1].decode(), value)
     return properties
 
 
+_QUOTES: Final = {"&quot;": '"', "&apos;": "'"}
 _PACKET: Final = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
-<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF{spaces}>
-<rdf:Description rdf:about=""{properties}>
-<xmpMM:History><rdf:Seq><rdf:li{done}/></rdf:Seq></xmpMM:History>
-</rdf:Description></rdf:RDF></x:xmpmeta>
+<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="" xmlns:aux="http://ns.adobe.com/exif/1.0/aux/"
+ xmlns:xmp="http://ns.adobe.com/xap/1.0/" xmlns:xmpMM="http://ns.adobe.com/xap/1.0/mm/"
+ xmlns:stEvt="http://ns.adobe.com/xap/1.0/sType/ResourceEvent#" xmp:CreatorTool={software}{lens}>
+<xmpMM:History><rdf:Seq>
+<rdf:li stEvt:action="filtered" stEvt:softwareAgent={software} stEvt:parameters={done}/>
+</rdf:Seq></xmpMM:History></rdf:Description></rdf:RDF></x:xmpmeta>
 <?xpacket end="r"?>"""
 _CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF), " "))
 """What XML has no way to write; cameras put it into names."""
@@ -338,18 +314,12 @@ _CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 
 
 def xmp_packet(metadata: PhotoMetadata, description: str, lens: str = "") -> bytes:
     """Return what EXIF has no tags for, and what was done; `lens` is what its owner calls it."""
-
-    def attributes(values: Mapping[str, object]) -> str:
-        known = {name: str(value) for name, value in values.items() if value is not None}
-        return "".join(f" {name}={quoteattr(value.translate(_CHARACTERS))}" for name, value in known.items())
-
-    done = {"stEvt:action": "filtered", "stEvt:softwareAgent": SOFTWARE, "stEvt:parameters": description}
-    packet = _PACKET.format(
-        spaces=attributes({f"xmlns:{prefix}": space for space, prefix in _SPACES.items()}),
-        properties=attributes({"xmp:CreatorTool": SOFTWARE, "aux:Lens": lens or metadata.lens.model}),
-        done=attributes(done),
+    software, named, done = (
+        quoteattr((text or "").translate(_CHARACTERS))
+        for text in (SOFTWARE, lens or metadata.lens.model, description)
     )
-    return packet.encode()
+    said = f" aux:Lens={named}" if lens or metadata.lens.model else ""
+    return _PACKET.format(software=software, lens=said, done=done).encode()
 
 
 # --- as EXIF tags of a written file -------------------------------------------------------------
@@ -366,30 +336,29 @@ def written_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Va
     exif: dict[int, Value | Written] = {
         0x829A: (RATIONAL, metadata.exposure_s),
         0x829D: (RATIONAL, metadata.aperture),
-        0x8827: (tiff.SHORT, iso and min(round(iso), 65535)),
-        0x9000: (tiff.UNDEFINED, b"0232"),  # ExifVersion
+        0x8827: (containers.SHORT, iso and min(round(iso), 65535)),
+        0x9000: (containers.UNDEFINED, b"0232"),  # ExifVersion
         0x9003: taken_at,
         0x9206: (RATIONAL, metadata.focus_m),
         0x920A: (RATIONAL, metadata.focal_mm),
         0xA20E: per_cm,  # FocalPlaneXResolution
         0xA20F: per_cm,
-        0xA210: (tiff.SHORT, pitch and 3),  # per centimetre
+        0xA210: (containers.SHORT, pitch and 3),  # per centimetre
         0xA431: (ASCII, metadata.body_serial),
         0xA433: (ASCII, metadata.lens.maker),
         0xA434: (ASCII, metadata.lens.model),
         0xA435: (ASCII, metadata.lens.serial),
     }
-    artist, owner = ((name or "").encode() for name in (metadata.artist, metadata.copyright))
     return {
         0x010E: (ASCII, description),
         0x010F: (ASCII, metadata.camera_maker),
         0x0110: (ASCII, metadata.camera_model),
-        0x0112: (tiff.SHORT, metadata.orientation),
+        0x0112: (containers.SHORT, metadata.orientation),
         0x0131: (ASCII, SOFTWARE),
         0x0132: taken_at,
-        0x013B: (ASCII, artist and artist + b"\0"),
-        0x8298: (ASCII, owner and owner + b"\0"),
-        tiff.EXIF: exif,
+        0x013B: (ASCII, metadata.artist and metadata.artist.encode() + b"\0"),
+        0x8298: (ASCII, metadata.copyright and metadata.copyright.encode() + b"\0"),
+        containers.EXIF: exif,
     }
 
 
@@ -410,11 +379,8 @@ _PACKED: Final = re.compile(rb"Raw profile type |XML:com\.adobe\.xmp\x00\x01")
 _HIDDEN: Final = b"prVt"  # type of a chunk that every reader skips: ancillary, private, safe to copy
 
 
-class Overwrite(NamedTuple):
-    """Bytes to be written over others of the same number."""
-
-    start: int
-    data: bytes
+Overwrite: TypeAlias = tuple[int, bytes]
+"""A place, and bytes to be written there over others of the same number."""
 
 
 def find_location(buffer: Buffer) -> tuple[list[Overwrite], bool]:
@@ -426,30 +392,31 @@ def find_location(buffer: Buffer) -> tuple[list[Overwrite], bool]:
     spans, chunks = list[Overwrite](), list[tuple[bytes, int, int]]()
     if buffer[:4] == b"\x89PNG":
         with contextlib.suppress(TruncatedImageError):
-            chunks.extend(png_chunks(buffer))
+            chunks.extend(containers.png_chunks(buffer))
     blocks = list(islice(_BLOCKS.finditer(buffer), MAX_BLOCKS + 1))
     places = [(0, False), *((start, False) for name, start, _ in chunks if name == b"eXIf")]
     places += [(block.end(), block[0] == b"CMT4") for block in blocks[:MAX_BLOCKS]]
     for place, is_of_gps in places:
         reader = TiffReader.open(buffer, place)
         # the chain of a structure, and what hangs on it
-        pointers = (tags.integer(tiff.GPS) for _, tags in reader.walk(tiff.SUB_DIRECTORIES, tiff.EXIF))
+        directories = reader.walk(containers.SUB_DIRECTORIES, containers.EXIF)
+        pointers = (tags.integer(containers.GPS) for _, tags in directories)
         for offset in [reader.first] if is_of_gps else pointers:
             spans += _directory(buffer, reader, offset)
     words = list(islice(_XMP_GPS.finditer(buffer), MAX_WORDS + 1))
     for match in words[:MAX_WORDS]:
         start, end = match.span(match.lastindex or 0)
-        spans.append(Overwrite(start, b" " * (end - start)))
-    spans = [span for span in spans if bytes(buffer[span.start : span.start + len(span.data)]) != span.data]
+        spans.append((start, b" " * (end - start)))
+    spans = [(at, data) for at, data in spans if bytes(buffer[at : at + len(data)]) != data]
     complete = len(blocks) <= MAX_BLOCKS and len(words) <= MAX_WORDS
     return _with_checksums(buffer, chunks, spans), complete
 
 
 def gps_directory(path: Path) -> dict[int, Value]:
     """Read the GPS directory of a photo, to be written into another file of it; empty without one."""
-    with opened_header(path, Limits()) as header:
+    with containers.opened_header(path, Limits()) as header:
         for reader in header.tiff:
-            gps, values = reader.below(reader.directory(reader.first)[0], tiff.GPS), dict[int, Value]()
+            gps, values = reader.below(reader.directory(reader.first)[0], containers.GPS), dict[int, Value]()
             for tag, entry in gps.items():
                 numbers = gps.numbers(tag)  # of texts none
                 if tag < MAX_TAGS and entry.size <= MAX_VALUE and all(map(math.isfinite, numbers)):
@@ -465,13 +432,13 @@ def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[Over
     start = reader.base + offset
     head = bytes(buffer[start : start + 2]) if tags else b""
     count = int.from_bytes(head, "little" if reader.order == "<" else "big")
-    end = start + 2 + count * tiff.ENTRY
+    end = start + 2 + count * containers.ENTRY
     if not 0 < count <= MAX_TAGS or end > len(buffer):
         return
     for entry in tags.values():
         if not start <= entry.offset < end and 0 < entry.size <= MAX_VALUE and entry.raw():
-            yield Overwrite(entry.offset, bytes(entry.size))
-    yield Overwrite(start, bytes(end - start))
+            yield entry.offset, bytes(entry.size)
+    yield start, bytes(end - start)
 
 
 def _with_checksums(
@@ -480,18 +447,15 @@ def _with_checksums(
     """Renew the checksums of a PNG's chunks that change; hide those whose metadata cannot be searched."""
     renewed = list(spans)
     for name, start, length in chunks:
-        if name == b"IDAT" or length > 2 * MAX_BLOCK_BYTES:
+        if name == b"IDAT" or length > 2 * containers.MAX_BLOCK_BYTES:
             continue
         chunk = bytearray(buffer[start - 4 : start + length])
+        inside = [(at - start + 4, data) for at, data in spans if start <= at < start + length]
         if name in {b"tEXt", b"zTXt", b"iTXt"} and _PACKED.match(chunk, 4):
-            chunk = bytearray(_HIDDEN + bytes(length))
-            renewed.append(Overwrite(start - 4, bytes(chunk)))
-        else:
-            inside = [span for span in spans if start <= span.start < start + length]
-            if not inside:
-                continue
-            for span in inside:
-                at = span.start - start + 4
-                chunk[at : at + len(span.data)] = span.data
-        renewed.append(Overwrite(start + length, struct.pack(">I", zlib.crc32(chunk[: length + 4]))))
+            inside = [(0, _HIDDEN + bytes(length))]
+            renewed.append((start - 4, inside[0][1]))
+        for at, data in inside:
+            chunk[at : at + len(data)] = data
+        if inside:
+            renewed.append((start + length, struct.pack(">I", zlib.crc32(chunk[: length + 4]))))
     return renewed

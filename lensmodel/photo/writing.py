@@ -21,10 +21,10 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 from lensmodel.core.names import full_name
 from lensmodel.core.types import BayerPattern, Planes
-from lensmodel.photo import colour, tiff
+from lensmodel.photo import colour, containers
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, Curve, Matrix
+from lensmodel.photo.containers import BYTE, LONG, SHORT, UNDEFINED, Written, write_strip
 from lensmodel.photo.metadata import written_tags, xmp_packet
-from lensmodel.photo.tiff import LONG, SHORT, Written
 from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, PhotoMetadata, remarks_log
 
 _ROWS: Final = 256  # rows that are encoded at a time: bounds the memory of the conversion
@@ -73,7 +73,7 @@ def write_image(
     path, metadata = Path(path), encoding.metadata.without_serials()
     if format.startswith("png"):
         metadata = replace(metadata, orientation=1)
-    tags = {**written_tags(metadata, description), tiff.GPS: gps or {}}
+    tags = {**written_tags(metadata, description), containers.GPS: gps or {}}
     xmp = xmp_packet(metadata, description, lens)
     _tell_losses(path.name, planes, encoding, format)
     linear = format == "tiff32" and color_space == "same" and encoding.transfer == "linear"
@@ -81,21 +81,21 @@ def write_image(
     pixels = _encoded(planes, target, {"tiff32": None, "jpeg": 255, "png8": 255}.get(format, 65535))
     with atomic(path) as file:
         if format == "jpeg":
-            exif = b"Exif\0\0" + tiff.laid_out(tags)
+            exif = b"Exif\0\0" + containers.laid_out(tags)
             options: dict[str, Any] = {"quality": quality, "subsampling": 0, "optimize": True}
             Image.fromarray(pixels).save(file, "JPEG", icc_profile=target.icc, exif=exif, xmp=xmp, **options)
         elif format.startswith("png"):
             chunks = {
                 b"iCCP": b"ICC\0\0" + zlib.compress(target.icc),
-                b"eXIf": tiff.laid_out(tags),
+                b"eXIf": containers.laid_out(tags),
                 b"iTXt": b"XML:com.adobe.xmp\0\0\0\0\0" + xmp,
             }
             _write_png(file, upright(pixels, encoding.metadata.orientation), chunks)
         else:
             numbers = SHORT, [3 if format == "tiff32" else 1] * 3  # SampleFormat: floating-point, or whole
-            of_rgb: Written = {262: (SHORT, 2), 339: numbers, _ICC_TAG: (tiff.UNDEFINED, target.icc)}
+            of_rgb: Written = {262: (SHORT, 2), 339: numbers, _ICC_TAG: (UNDEFINED, target.icc)}
             tags |= _linear_dng_tags(encoding) if format == "dng" else of_rgb
-            tiff.write_strip(file, {**tags, _XMP_TAG: (tiff.BYTE, xmp)}, pixels)
+            write_strip(file, {**tags, _XMP_TAG: (BYTE, xmp)}, pixels)
 
 
 def _tell_losses(name: str, planes: Planes, encoding: Encoding, output: OutputFormat) -> None:
@@ -185,8 +185,8 @@ def _linear_dng_tags(encoding: Encoding) -> Written:
         # LibRaw 0.22 takes a black level of linear images off the values but not off the white level
         50714: (SHORT, (0, 0, 0)),
         50717: (SHORT, (65535, 65535, 65535)),
-        OPCODES_2: (tiff.UNDEFINED, encoding.opcodes_2),
-        OPCODES_3: (tiff.UNDEFINED, encoding.opcodes_3),
+        OPCODES_2: (UNDEFINED, encoding.opcodes_2),
+        OPCODES_3: (UNDEFINED, encoding.opcodes_3),
     }
 
 
@@ -239,14 +239,14 @@ def write_bayer_dng(
         **dng_tags(metadata, color_matrix, as_shot_neutral, baseline_exposure),
         262: (SHORT, 32803),  # PhotometricInterpretation: a colour filter array (TIFF/EP)
         33421: (SHORT, (2, 2)),  # CFARepeatPatternDim
-        33422: (tiff.BYTE, bytes("RGB".index(letter) for letter in pattern)),  # CFAPattern
-        50710: (tiff.BYTE, b"\x00\x01\x02"),  # CFAPlaneColor: red, green, blue
+        33422: (BYTE, bytes("RGB".index(letter) for letter in pattern)),  # CFAPattern
+        50710: (BYTE, b"\x00\x01\x02"),  # CFAPlaneColor: red, green, blue
         50711: (SHORT, 1),  # CFALayout: rectangular
         50714: (SHORT, black),
         50717: (SHORT, white),
     }
     with atomic(Path(path)) as file:
-        tiff.write_strip(file, tags, mosaic)
+        write_strip(file, tags, mosaic)
 
 
 def dng_tags(
@@ -260,14 +260,14 @@ def dng_tags(
     unique = full_name(metadata.camera_maker, metadata.camera_model) or "Unknown"
     return {
         254: (LONG, 0),  # NewSubfileType: the full image
-        50706: (tiff.BYTE, bytes((1, 4, 0, 0))),  # DNGVersion
-        50707: (tiff.BYTE, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
-        50708: (tiff.ASCII, unique),  # UniqueCameraModel
+        50706: (BYTE, bytes((1, 4, 0, 0))),  # DNGVersion
+        50707: (BYTE, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
+        50708: (containers.ASCII, unique),  # UniqueCameraModel
         50713: (SHORT, (1, 1)),  # BlackLevelRepeatDim
-        50721: (tiff.SRATIONAL, np.ravel(color_matrix).tolist()),  # ColorMatrix1
-        50728: (tiff.RATIONAL, np.ravel(as_shot_neutral).tolist()),
-        50730: (tiff.SRATIONAL, baseline_exposure),
-        50735: (tiff.ASCII, metadata.body_serial),  # CameraSerialNumber
+        50721: (containers.SRATIONAL, np.ravel(color_matrix).tolist()),  # ColorMatrix1
+        50728: (containers.RATIONAL, np.ravel(as_shot_neutral).tolist()),
+        50730: (containers.SRATIONAL, baseline_exposure),
+        50735: (containers.ASCII, metadata.body_serial),  # CameraSerialNumber
         50778: (SHORT, 21),  # CalibrationIlluminant1: D65, in the numbers of Exif's LightSource
     }
 

@@ -14,7 +14,7 @@ from scipy import ndimage
 from lensmodel import photo
 from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
-from lensmodel.photo.tiff import SHORT, write_strip
+from lensmodel.photo.containers import SHORT, write_strip
 from lensmodel.photo.writing import dng_tags, write_bayer_dng
 
 BLACK, WHITE = 512, 15000

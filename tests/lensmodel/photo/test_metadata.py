@@ -22,7 +22,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from lensmodel import photo
 from lensmodel.core.errors import TruncatedImageError
-from lensmodel.photo import tiff
+from lensmodel.photo import containers
 from lensmodel.photo.containers import opened_header
 from lensmodel.photo.development import opened_raw
 from lensmodel.photo.metadata import Said, find_location, is_placeholder, read_xmp
@@ -313,9 +313,13 @@ def cleaned(data: bytes) -> bytes:
 def tiff_with_gps() -> bytes:
     """Write a grey TIFF with our own hand: image libraries leave GPS directories out of TIFF files."""
     out = io.BytesIO()
-    places = {1: (tiff.ASCII, "N"), 2: (tiff.RATIONAL, LATITUDE)}
-    tags = {262: (tiff.SHORT, 1), 271: (tiff.ASCII, "Maker"), tiff.EXIF: {0x829D: (tiff.RATIONAL, 1.4)}}
-    tiff.write_strip(out, {**tags, tiff.GPS: places}, PIXELS[:, :, 0])
+    places = {1: (containers.ASCII, "N"), 2: (containers.RATIONAL, LATITUDE)}
+    tags = {
+        262: (containers.SHORT, 1),
+        271: (containers.ASCII, "Maker"),
+        containers.EXIF: {0x829D: (containers.RATIONAL, 1.4)},
+    }
+    containers.write_strip(out, {**tags, containers.GPS: places}, PIXELS[:, :, 0])
     return out.getvalue()
 
 
@@ -374,7 +378,7 @@ def test_the_checksums_of_a_png_are_right_afterwards_and_packed_metadata_are_hid
     assert read.info["Title"] == "stays"
 
 
-BOX = b"CMT4" + tiff.laid_out({1: (tiff.ASCII, "N"), 2: (tiff.RATIONAL, LATITUDE)})
+BOX = b"CMT4" + containers.laid_out({1: (containers.ASCII, "N"), 2: (containers.RATIONAL, LATITUDE)})
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from lensmodel import measured
 from lensmodel.core.psf import PsfField, as_kernel
 from lensmodel.core.types import Channel, FieldPosition, Kernel
 from lensmodel.measured.target import Target
-from lensmodel.model import LensModel
+from lensmodel.model import LensModel, ModelField
 from lensmodel.photo import develop
 from lensmodel.simulate import LENS_KINDS, draw_lens, photograph, write_photo
 
@@ -79,4 +79,4 @@ def measured_field(case: Case, path: Path) -> PsfField:
     write_photo(path, photograph(scene, case.lens, case.settings, case.camera, rng, exposure=_EXPOSURE))
     photo, method = develop(path), Target(details=(page.detail,))
     samples = method.measure([photo], size=SIZE, settings=case.settings, photo_id="target")
-    return LensModel.fit(samples).field(case.settings, pitch_um=case.camera.pitch_um)
+    return ModelField(LensModel.fit(samples), case.settings, case.camera.pitch_um)

@@ -19,7 +19,7 @@ from lensmodel.blind import sampling
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfField, as_kernel, rms_width
 from lensmodel.core.types import FieldPosition, Frame, Kernel
-from lensmodel.model import LensModel
+from lensmodel.model import LensModel, ModelField
 from lensmodel.patches import r_map
 from lensmodel.photo import develop
 
@@ -115,7 +115,9 @@ def _fig4(plan: Reproduction, photos: Path, path: Path, workers: int) -> dict[st
     for p in chosen:
         axes[1].add_patch(Rectangle((p.col, p.row), p.size, p.size, fill=False, edgecolor="#ffb300"))
     _kernels(axes[2], developed.frame, [(s.position, s.kernel) for s in green])
-    _kernels(axes[3], developed.frame, _asked(LensModel.fit(samples).field(case.settings), developed.frame))
+    _kernels(
+        axes[3], developed.frame, _asked(ModelField(LensModel.fit(samples), case.settings), developed.frame)
+    )
     _kernels(axes[4], developed.frame, _asked(case.truth(), developed.frame))
     titles = ("Confidence map", f"{len(chosen)} patches", "Their PSFs", "Regressed field", "The truth", "")
     for ax, title in zip(axes, titles, strict=True):

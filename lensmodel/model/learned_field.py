@@ -2,9 +2,8 @@
 
 Cross-attention from a place and settings to samples is Nadaraya-Watson regression (paper, eq. 4 to 7) whose
 weights and values a network has learned: the weight of a sample follows from its distance in place and
-settings and from what its patch says, and the answer is a weighted sum over samples. A question attends to
-the nearest `NEAREST` samples, spread over photos, whose keys and values are computed once for each
-neighbourhood: so it takes the same time for a hundred samples and a million.
+settings and from what its patch says. A question attends to the nearest `NEAREST` samples, whose keys and
+values are computed once for each neighbourhood: it takes the same time for a hundred samples and a million.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from lensmodel.neural import RING_MIDDLES, FieldAnswer, FieldNetwork, Memory, co
 
 NEAREST: Final = 256  # samples that a question attends to (chosen: the patches of three photos)
 
-_CANDIDATES: Final = 4 * NEAREST  # among which the photos share (chosen: a dozen photos at one place)
 # steps of x, y, stops, octaves and dioptres within which questions share a neighbourhood (chosen)
 _CELL: Final = np.array([0.25, 0.25, 1.0 / 3.0, 0.25, 0.5]) / query.UNITS
 _MEMORIES: Final = 64  # neighbourhoods whose keys are kept (chosen: a whole picture's, a megabyte each)
@@ -44,13 +42,12 @@ class LearnedField:
         self._conditions = np.array([conditions_of(s.settings, s.pixel_pitch_um, p.kind) for s, p in pairs])
         self._xy = np.array([s.position.xy for s in samples])  # half diagonals, to the right and up
         self._tokens = self._tokens_of(samples, patches)
-        self._where = np.array([query.in_units(s.position, s.settings) for s in samples])
+        self._where = query.in_units(query.points(samples))
         known = (column[~np.isnan(column)] for column in self._where.T)
         self._usual = np.array([np.median(values) if values.size else 0.0 for values in known])
         self._usual_pitch = camera_bodies.usual_pitch(samples)
         self._pitch = np.array([s.pixel_pitch_um for s in samples], dtype=np.float64)  # NaN = unknown
-        self._photos = np.array([s.photo for s in samples], dtype=object)
-        self._photo = np.unique(self._photos.astype(str), return_inverse=True)[1]
+        self._photos = np.array([s.photo for s in samples])
         self._tree = lru_cache(maxsize=4)(self._tree_of)
         self._memory = lru_cache(maxsize=_MEMORIES)(self._memory_of)
         self._answer = lru_cache(maxsize=_ANSWERS)(self._answer_of)
@@ -79,7 +76,7 @@ class LearnedField:
             min(float(answer.error[channel]), 1.0),
             np.asarray(answer.weights, dtype=np.float64),
             self._photos[rows],
-            query.nearest(self._where[rows], query.in_units(position, settings)),
+            query.nearest(self._where[rows], query.in_units(query.point(position, settings))),
             np.interp(scale * RING_MIDDLES, RING_MIDDLES, answer.ring_error[channel]),
         )
 
@@ -90,7 +87,7 @@ class LearnedField:
         own = self._usual_pitch
         if own is not None and pitch_um is not None and self._of_pitch(pitch_um).any():
             own = pitch_um
-        cell = np.round(query.in_units(position, settings) / _CELL)
+        cell = np.round(query.in_units(query.point(position, settings)) / _CELL)
         steps = tuple(None if np.isnan(step) else float(step) for step in cell)
         rows, memory, kind = self._memory(own, () if len(self._tree(own)[0]) <= NEAREST else steps)
         asked = conditions_of(settings, own, kind)
@@ -100,22 +97,14 @@ class LearnedField:
         self, pitch_um: float | None, cell: tuple[float | None, ...]
     ) -> tuple[NDArray[np.intp], Memory, PatchKind]:
         """Samples near a cell of places, or all; their keys and values; the usual kind of files."""
-        rows = self._nearest(pitch_um, np.array(cell, dtype=np.float64)) if cell else self._tree(pitch_um)[0]
+        rows, tree = self._tree(pitch_um)
+        if cell:
+            middle = np.array(cell, dtype=np.float64) * _CELL
+            near = tree.query(np.where(np.isnan(middle), self._usual, middle), k=NEAREST)[1]
+            rows = rows[np.sort(near)]
         tokens = self._tokens[rows].astype(np.float32)
         memory = self.network.memory(tokens, self._xy[rows], self._conditions[rows])
         return rows, memory, KINDS[int(np.bincount(self._conditions[rows, -1].astype(int)).argmax())]
-
-    def _nearest(self, pitch_um: float | None, cell: NDArray[np.float64]) -> NDArray[np.intp]:
-        """The `NEAREST` samples of a pitch, as many of each photo."""
-        rows, tree = self._tree(pitch_um)
-        point = np.where(np.isnan(cell), self._usual, cell * _CELL)
-        distance, near = tree.query(point, k=min(_CANDIDATES, len(rows)))
-        photo = self._photo[rows[near]]
-        by_photo = np.argsort(photo, kind="stable")  # nearest first within each
-        starts = np.flatnonzero(np.diff(photo[by_photo], prepend=-1))
-        rank = np.empty(len(near), dtype=np.intp)
-        rank[by_photo] = np.arange(len(near)) - np.repeat(starts, np.diff(starts, append=len(near)))
-        return rows[np.sort(near[np.lexsort((distance, rank))[:NEAREST]])]
 
     def _tree_of(self, pitch_um: float | None) -> tuple[NDArray[np.intp], scipy.spatial.cKDTree]:
         """Samples of a pixel pitch, an unknown one being any, and a tree over their places and settings."""

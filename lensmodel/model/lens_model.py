@@ -85,7 +85,7 @@ class LensModel:
             kernel = as_kernel(sum(share * part.kernel for share, part in zip(shares, parts, strict=True)))
         weights = np.concatenate([s * part.weights for s, part in zip(shares, parts, strict=True)])
         photos = np.concatenate([part.photos for part in parts])
-        names, number = np.unique(photos.astype(str), return_inverse=True)
+        names, number = np.unique(photos, return_inverse=True)
         return PsfAnswer(
             kernel=kernel,
             predicted_error=min(float(precision.sum() ** -0.5), 1.0),
@@ -111,10 +111,6 @@ class LensModel:
         if self._attention is None and self._regression is not None:
             return self._regression.kernels(positions, settings, size, pitch_um)
         return np.stack([self.query(place, settings, size, pitch_um=pitch_um).kernel for place in positions])
-
-    def field(self, settings: LensSettings, *, pitch_um: float | None = None) -> ModelField:
-        """Return the PSF of every place and channel at these settings, for pixels of some size."""
-        return ModelField(self, settings, pitch_um)
 
     def _asked(self, size: int, pitch_um: float | None) -> float | None:
         """The pitch of an answer, after refusing questions that have none."""
@@ -167,8 +163,7 @@ class ModelField:
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         """Return the kernel of odd side `size` at a field position, in the image frame."""
-        settings = self.settings.with_channel(channel)
-        return np.asarray(self.model.kernels([position], settings, size, pitch_um=self.pitch_um)[0])
+        return self.answer_at(position, channel, size).kernel
 
     def answer_at(self, position: FieldPosition, channel: Channel, size: int) -> PsfAnswer:
         """Return the kernel of odd side `size` at a field position, with what is expected of its error."""

@@ -49,7 +49,6 @@ from lensmodel.core.numerics import jit, on_simplex
 from lensmodel.core.psf import PsfSample, resized, second_moments
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, query
-from lensmodel.model.bandwidths import bandwidths, cross_validate
 from lensmodel.model.query import PAPER, Part
 
 _REACH: Final = 5.0  # bandwidths: a Gaussian has fallen to 4e-6 there
@@ -121,28 +120,23 @@ class Regression:
         points = query.points(common)
         self._widths = WidthField() if mode == PAPER else WidthField.fit(common, base)
         self._local = LocalKernels.of(common, points, self._widths)
-        weights, self._held_out, self._scatter, factors = cross_validate(
+        weights, self._held_out, self._scatter, factors = query.cross_validate(
             common, mode, self._local.upright, points, base
         )
-        self._where = np.array([query.in_units(s.position, s.settings) for s in common])
+        self._where = query.in_units(points)
         # what the estimators expect of their samples; 0 where they expect nothing
         self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
-        self._photos = np.array([s.photo for s in samples], dtype=object)
-        self._around = Neighbourhood(points, weights, bandwidths(points, mode, factors))
+        self._photos = np.array([s.photo for s in samples])
+        self._around = Neighbourhood(points, weights, query.bandwidths(points, mode, factors))
 
     def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:
         """Answer at a place, in pixels of some pitch."""
         near = self._around.near([position], settings)
-        where, asked = self._where[near.rows], query.in_units(position, settings)
-        nearest = query.nearest(where, asked)
-        outward = math.hypot(*asked[:2]) - float(np.hypot(where[:, 0], where[:, 1]).max())
-        return Part(
-            self.kernels([position], settings, size, pitch_um)[0],
-            self._error(near, nearest, max(outward, 0.0)),
-            near.weights,
-            self._photos[near.rows],
-            nearest,
-        )
+        where, asked = self._where[near.rows], query.in_units(query.point(position, settings))
+        nearest, outermost = query.nearest(where, asked), float(np.hypot(where[:, 0], where[:, 1]).max())
+        error = self._error(near, nearest, max(math.hypot(*asked[:2]) - outermost, 0.0))
+        kernel = self.kernels([position], settings, size, pitch_um)[0]
+        return Part(kernel, error, near.weights, self._photos[near.rows], nearest)
 
     def kernels(
         self, positions: Sequence[FieldPosition], settings: LensSettings, size: int, pitch_um: float | None
@@ -170,7 +164,7 @@ class Regression:
         Estimators that err alike do not scatter: at least half of what they expect is taken for shared.
         """
         weight, rows = near.weights, near.rows
-        _, number = np.unique(self._photos[rows].astype(str), return_inverse=True)
+        _, number = np.unique(self._photos[rows], return_inverse=True)
         independent = 1.0 / float((np.bincount(number, weight) ** 2).sum())
         held_out = float(weight @ self._held_out[rows] ** 2)
         scatter = min(float(weight @ self._scatter[rows]), held_out)
@@ -268,8 +262,7 @@ def _log_widths(sample: PsfSample) -> tuple[float, float]:
     return float(0.5 * np.log(max(uu, 0.04))), float(0.5 * np.log(max(vv, 0.04)))
 
 
-FINER = 2  # coefficients for each pixel along an axis; 1 where memory is short
-_MOST_BYTES = 1 << 29  # beyond, kernels are kept no finer than their pixels
+_FINER = 2  # coefficients for each pixel along an axis (chosen)
 
 # Degrees of the spline that fills the finer grid (chosen): a cubic one would be off by .7 % of the peak of a
 # Gaussian of 1.1 px turned by 45 degrees; kernels up to the Nyquist frequency ripple with a high one
@@ -303,25 +296,23 @@ class LocalKernels:
     """Splines of the samples with the frames that they belong to."""
 
     side: int  # odd side of the stored kernels
-    splines: NDArray[np.float32]  # (n, (finer (side - 1) + 1 + 2 rims)^2), coefficients
+    splines: NDArray[np.float32]  # (n, (2 (side - 1) + 1 + 2 rims)^2), coefficients
     angles: NDArray[np.float64]  # (n,), phi of the places in radians
     radii: NDArray[np.float64]  # (n,), of the light in steps of the grid
     widths: NDArray[np.float64]  # (n, 2), scales (s_u, s_v) of the places
-    finer: int = FINER  # coefficients for each pixel along an axis
 
     @classmethod
     def of(cls, samples: Sequence[PsfSample], where: NDArray[np.float64], field: WidthField) -> LocalKernels:
         """Keep samples at points `where` (n, 7)."""
         side = max(s.kernel.shape[0] for s in samples)
-        finer = FINER if 4 * (FINER * (side - 1) + 1) ** 2 * len(samples) <= _MOST_BYTES else 1
-        stored = np.empty((len(samples), (finer * (side - 1) + 1 + 2 * _RIM) ** 2), dtype=np.float32)
+        stored = np.empty((len(samples), (_FINER * (side - 1) + 1 + 2 * _RIM) ** 2), dtype=np.float32)
         radii = np.empty(len(samples))
         for i, sample in enumerate(samples):
-            spline = coefficients(resized(sample.kernel, side), finer)
+            spline = coefficients(resized(sample.kernel, side))
             lit = np.argwhere(np.abs(spline) > _LIGHT * np.abs(spline).max()) - spline.shape[0] // 2
             stored[i], radii[i] = np.pad(spline, _RIM).ravel(), np.hypot(*lit.T).max() + _SPLINE_REACH
         angles = np.array([s.position.phi for s in samples])
-        return cls(side, stored, angles, radii, field.over(where), finer)
+        return cls(side, stored, angles, radii, field.over(where))
 
     def kernels(
         self, answers: Answers, angles: NDArray[np.float64], widths: NDArray[np.float64], size: int
@@ -363,7 +354,7 @@ class LocalKernels:
         """Weighted sums of the samples of each answer, which may be negative and off the centre."""
         rows, asked = answers.rows, np.repeat(np.arange(len(angles)), answers.counts)
         scale = self.widths[rows] / widths[asked]
-        maps = _frames(self.angles[rows]).mT @ ((scale * self.finer)[:, :, None] * _frames(angles[asked]))
+        maps = _frames(self.angles[rows]).mT @ ((scale * _FINER)[:, :, None] * _frames(angles[asked]))
         factors = answers.weights * scale[:, 0] * scale[:, 1]
         starts = np.concatenate([[0], np.cumsum(answers.counts)])
         out = np.zeros((len(angles), size, size))
@@ -389,8 +380,8 @@ def _frames(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([np.stack([-s, c], axis=-1), np.stack([-c, -s], axis=-1)], axis=-2)
 
 
-def coefficients(kernel: NDArray[np.floating], finer: int = FINER) -> NDArray[np.float64]:
-    """Coefficients of the spline through the pixels of a kernel, `(k, k)` to `(finer (k - 1) + 1,) * 2`."""
+def coefficients(kernel: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Coefficients of the spline through the pixels of a kernel, `(k, k)` to `(2 (k - 1) + 1,) * 2`."""
     turns = 1.0 - 2.0 * (np.arange(kernel.shape[0]) % 2)
     contrast = max(abs(float(turns @ kernel.sum(axis=1))), abs(float(turns @ kernel.sum(axis=0))))
     low, high = _ALIASED
@@ -398,22 +389,22 @@ def coefficients(kernel: NDArray[np.floating], finer: int = FINER) -> NDArray[np
     spline = np.zeros(())
     for share, degree in ((1.0 - narrow, _SMOOTH), (narrow, _NARROW)):
         if share > 0:
-            refining = _refining(kernel.shape[0], degree, finer)
+            refining = _refining(kernel.shape[0], degree)
             spline = spline + share * (refining @ kernel @ refining.T)
     return np.asarray(spline, dtype=np.float64)
 
 
 @lru_cache(maxsize=16)
-def _refining(side: int, degree: int, finer: int) -> NDArray[np.float64]:
+def _refining(side: int, degree: int) -> NDArray[np.float64]:
     """Matrix from the pixels of an axis to the coefficients of the finer grid, zeros around both."""
     half = side // 2
-    fine = np.arange(-half * finer, half * finer + 1)
+    fine = np.arange(-half * _FINER, half * _FINER + 1)
     pixels = np.pad(np.eye(side), ((_MARGIN, _MARGIN), (0, 0)))
     through = scipy.interpolate.make_interp_spline(
         np.arange(-half - _MARGIN, half + _MARGIN + 1), pixels, k=degree
     )
     sampling = (4.0 * np.eye(fine.size) + np.eye(fine.size, k=1) + np.eye(fine.size, k=-1)) / 6.0
-    return np.asarray(np.linalg.inv(sampling) @ through(fine / finer))
+    return np.asarray(np.linalg.inv(sampling) @ through(fine / _FINER))
 
 
 # Of the cubic B-spline (M. Unser, IEEE Signal Processing Magazine 16, 1999, eq. 4), in single precision.

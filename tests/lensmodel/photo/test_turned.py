@@ -17,7 +17,7 @@ from lensmodel.blind.sampling import find_patches
 from lensmodel.core.errors import TurnedPixelsError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel
+from lensmodel.model import LensModel, ModelField
 
 
 def written(path: Path, rows: int, cols: int, tags: dict[int, object]) -> photo.PhotoInfo:
@@ -72,7 +72,7 @@ def posterior(
         for r in (0.2, 0.5, 0.8)
         for phi in np.linspace(-math.pi, math.pi, 16, endpoint=False)
     ]
-    field = LensModel.fit(samples, "paper").field(LensSettings(aperture=2.0))
+    field = ModelField(LensModel.fit(samples, "paper"), LensSettings(aperture=2.0))
     found = _Posteriors(field, turns).posterior_at(place, "g")
     return found.kernel, found.error
 

@@ -25,7 +25,7 @@ from lensmodel.photo import colour, containers
 from lensmodel.photo.containers import COPY_AGAIN
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
-from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
+from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.values import (
     Encoding,
     LensIdentity,
@@ -299,7 +299,7 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
         sensor_noise=sensor_noise,
         coding_noise=coding_noise(said.header.coarseness, colour.curves_of("srgb")[1]),
         cfa=cfa,
-        grain=(1.0, 1.0, 1.0) if sensor_noise is not None else grain_of(planes, noise, clip),
+        grain=(1.0,) * 3 if sensor_noise is not None else tuple(map(graininess, planes, noise, clip)),
         remarks=tuple(remarks),
     )
 
@@ -438,7 +438,7 @@ def _develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
         clip=clip,
         info=info,
         encoding=Encoding(8 * depth, transfer, icc, info.metadata.without_serials()),
-        grain=grain_of(planes, noise, clip),
+        grain=tuple(map(graininess, planes, noise, clip)),
         coding_noise=coding_noise(header.coarseness, green),
         chroma_step=header.chroma_step,
         remarks=tuple(remarks),

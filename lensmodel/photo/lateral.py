@@ -21,8 +21,7 @@ _POINTS = 5  # of each block of the frame: its strongest corners (chosen)
 _WINDOW = 48  # pixels that are correlated: more than any lateral colour, of one shift (chosen)
 _SEARCH = 8  # largest shift looked for, pixels
 _MIN_CORRELATION = 0.8  # of two channels: below, colours differ and edges do not match (chosen)
-_MIN_POINTS = 30
-"""That a polynomial of four terms is fitted to: some seven for each, of which a few may be wrong (chosen)."""
+_MIN_POINTS = 30  # that a polynomial is fitted to: some seven for each term, a few may be wrong (chosen)
 _LARGEST = 0.1  # of each term, relative to the radius (chosen): lenses stay below a hundredth
 _BAND = 1024  # rows at once: memory (chosen)
 _TAPER = np.outer(np.hanning(_WINDOW + 1)[:-1], np.hanning(_WINDOW + 1)[:-1])
@@ -40,17 +39,14 @@ class LateralColour:
     red: Polynomial  # (a, b, c, v), with r in half diagonals; (0, 0, 0, 1) is no displacement
     blue: Polynomial
     half_diagonal: float  # half diagonal of the frame in pixels
-    # How many points of the photo the estimate rests on. With fewer than 30 nothing is claimed: the
-    # polynomial is the identity.
-    red_points: int = 0
+    red_points: int = 0  # of the photo on which the estimate rests; with fewer than 30 nothing is claimed
     blue_points: int = 0
 
     def __post_init__(self) -> None:
-        terms = (*self.red, *self.blue, self.half_diagonal)
-        if not all(math.isfinite(term) for term in terms) or self.half_diagonal <= 0.0:
-            raise InvalidInputError(f"lateral colour needs finite terms and a positive size, got {self}")
-        if max(abs(self.red[3] - 1.0), abs(self.blue[3] - 1.0)) > _LARGEST + 1e-9:
-            raise InvalidInputError(f"v must be near 1, got {self.red[3]} (red) and {self.blue[3]} (blue)")
+        finite = all(map(math.isfinite, (*self.red, *self.blue, self.half_diagonal)))
+        scale = max(abs(self.red[3] - 1.0), abs(self.blue[3] - 1.0))
+        if not finite or self.half_diagonal <= 0.0 or scale > _LARGEST + 1e-9:
+            raise InvalidInputError(f"lateral colour needs finite terms, a size, and v near 1, got {self}")
 
     def displacement(self, r: float, channel: Channel) -> float:
         """Pixels outwards by which a channel's image lies beyond the green one at radius `r`."""
@@ -75,18 +71,15 @@ def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[flo
     """
     full, half = 0.98 * np.broadcast_to(clip, 3), _WINDOW // 2 + _SEARCH  # with a margin for the band-pass
     found: dict[int, list[tuple[float, float]]] = {0: [], 2: []}  # radius and outward shift of red and blue
-    for row, col in _points(planes[1], frame):
+    for row, col in _points(planes[1]):
         window = planes[:, max(row - half, 0) : row + half, max(col - half, 0) : col + half]
         if window.shape[1:] != (2 * half, 2 * half) or (window.max(axis=(1, 2)) >= full).any():
             continue
-        # Same geometry as FieldPosition: u points outwards from the centre.
-        position = frame.position(row, col)
-        out = (-math.sin(position.phi), math.cos(position.phi))
-        green = _banded(window[1])
+        position, green = frame.position(row, col), _banded(window[1])
         for index, points in found.items():
-            shift = _shift(_banded(window[index]), green)
-            if shift is not None:
-                points.append((position.r, shift[0] * out[0] + shift[1] * out[1]))
+            if (shift := _shift(_banded(window[index]), green)) is not None:
+                outwards = shift[1] * math.cos(position.phi) - shift[0] * math.sin(position.phi)
+                points.append((position.r, outwards))
     columns = (np.reshape(points, (-1, 2)).T for points in found.values())
     red, blue = (_fit(r, shift, frame.half_diagonal) for r, shift in columns)
     return LateralColour(red, blue, frame.half_diagonal, len(found[0]), len(found[2]))
@@ -115,30 +108,25 @@ def resample(planes: Planes, frame: Frame, lateral: LateralColour) -> Planes:
     return out
 
 
-def _points(green: Plane, frame: Frame) -> Iterator[tuple[int, int]]:
+def _points(green: Plane) -> Iterator[tuple[int, int]]:
     """Pixels with structure in both directions, spread over the cells of the frame."""
     # A corner is found as well on a coarser grid, at a fraction of the cost.
-    bin_by = max(1, min(frame.height, frame.width) // 1000)
+    bin_by = max(1, min(green.shape) // 1000)
     # the root evens noise and contrast in shadows and lights
     coarse = np.sqrt(np.maximum(block_means(green, bin_by), 0.0))
     rows, cols = coarse.shape
-    slope_r = ndimage.gaussian_filter(coarse, 1.0, order=(1, 0))
-    slope_c = ndimage.gaussian_filter(coarse, 1.0, order=(0, 1))
-    rr, cc, rc = (
-        ndimage.gaussian_filter(product, 4.0)
-        for product in (slope_r * slope_r, slope_c * slope_c, slope_r * slope_c)
-    )
+    r, c = (ndimage.gaussian_filter(coarse, 1.0, order=order) for order in ((1, 0), (0, 1)))
+    rr, cc, rc = (ndimage.gaussian_filter(product, 4.0) for product in (r * r, c * c, r * c))
     weaker = (rr + cc) / 2.0 - np.sqrt(((rr - cc) / 2.0) ** 2 + rc**2)
     apart = max(_WINDOW // (2 * bin_by), 3)
     peak = (weaker == ndimage.maximum_filter(weaker, size=2 * apart + 1)) & (weaker > 1e-7)
-    for i in range(_CELLS):
-        for j in range(_CELLS):
-            top, left = i * rows // _CELLS, j * cols // _CELLS
-            part = (slice(top, (i + 1) * rows // _CELLS), slice(left, (j + 1) * cols // _CELLS))
-            peaks = np.argwhere(peak[part])
-            strength = weaker[part][tuple(peaks.T)]
-            for row, col in peaks[np.argsort(-strength, kind="stable")[:_POINTS]]:
-                yield int((top + row) * bin_by), int((left + col) * bin_by)
+    for i, j in np.ndindex(_CELLS, _CELLS):
+        top, left = i * rows // _CELLS, j * cols // _CELLS
+        part = (slice(top, (i + 1) * rows // _CELLS), slice(left, (j + 1) * cols // _CELLS))
+        peaks = np.argwhere(peak[part])
+        strength = weaker[part][tuple(peaks.T)]
+        for row, col in peaks[np.argsort(-strength, kind="stable")[:_POINTS]]:
+            yield int((top + row) * bin_by), int((left + col) * bin_by)
 
 
 def _banded(window: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -192,7 +180,7 @@ def _huber(columns: NDArray[np.float64], shift: NDArray[np.float64]) -> tuple[ND
         root = np.sqrt(np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(residual), 1e-12)))
         asked = np.linalg.lstsq(columns * root[:, None], shift * root, rcond=None)[0]
         # few pixels and noise may ask for more than any lens does
-        solution = np.clip(asked, -_LARGEST, _LARGEST, dtype=np.float64)
+        solution = np.clip(asked, -_LARGEST, _LARGEST)
         residual = shift - columns @ solution
     size = np.minimum(np.abs(residual), 3.0 * scale)  # gross outliers count once, not squared
     return solution, float(np.mean(size**2)) + 1e-8

@@ -23,7 +23,6 @@ from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.values import PlaneNoise
 
 _XTRANS_SIDE: Final = 512  # pixels: LibRaw demosaics no smaller X-Trans (its xtrans_interpolate)
-_GREEN: Final = 1  # the number of green among the colours of a mosaic
 _BAND: Final = 16  # rows that are judged together by `Mosaic.of`
 
 _CLUSTER: Final = 0.005  # width of the pile of saturated pixels in the range: full wells differ a little
@@ -40,48 +39,36 @@ class Mosaic:
     colours: NDArray[np.uint8]  # 0 red, 1 green, 2 blue, 3 second green
     black: tuple[float, ...]  # black level of each of the four
     white: int  # level that the file states for saturation
-    is_bayer: bool  # the pattern repeats every 2 x 2 pixels; false for X-Trans
+    period: int  # pixels after which the colours repeat: 2 of Bayer, 6 of X-Trans
 
     @classmethod
     def of(cls, raw: rawpy.RawPy) -> Mosaic | None:
-        """Take the mosaic of an opened file, refuse a damaged one; `None` where pixels have all colours."""
+        """Take the mosaic of a file, `None` where pixels have all colours; refuse what no sensor gives."""
         if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
             return None
         letters = raw.color_desc.decode("ascii", "replace")
         require_known_mosaic(["".join(letters[colour] for colour in row) for row in raw.raw_pattern])
-        black = tuple(float(level) for level in raw.black_level_per_channel)
-        mosaic = cls(
-            raw.raw_image_visible,
-            raw.raw_colors_visible,
-            black,
-            int(raw.white_level),
-            raw.raw_pattern.shape == (2, 2),
-        )
-        mosaic._check()
-        return mosaic
-
-    def _check(self) -> None:
-        """Refuse numbers that no sensor gives, although the decoder was content."""
-        height, width = self.values.shape
-        if not self.is_bayer and min(height, width) < _XTRANS_SIDE:
+        black, values = tuple(map(float, raw.black_level_per_channel)), raw.raw_image_visible
+        mosaic = cls(values, raw.raw_colors_visible, black, int(raw.white_level), len(raw.raw_pattern))
+        height, width = values.shape
+        if mosaic.period == 6 and min(height, width) < _XTRANS_SIDE:
             raise UnsupportedFormatError(
                 f"{width} x {height} pixels of an X-Trans mosaic are too few to be demosaiced: give the "
                 f"whole frame, at least {_XTRANS_SIDE} pixels high"
             )
-        low, high = self.values.min(axis=1), self.values.max(axis=1)
+        low, high = values.min(axis=1), values.max(axis=1)
         if low.min() == high.max():
             raise RawDecodeError(f"every pixel of the RAW data is {int(low[0])}; the file holds no picture")
         # A row in which all is saturated is a bright sky, and no damage.
-        dead = float(np.mean((low == high) & (low < 0.9 * self.white)))
+        dead = float(np.mean((low == high) & (low < 0.9 * mosaic.white)))
         if dead > 0.02:
             raise TruncatedImageError(
                 f"{dead:.0%} of the rows of the RAW data are empty; the file was cut off"
             )
-        random = self._random_share()
-        if random > 0.25:
-            raise RawDecodeError(
-                f"{random:.0%} of the RAW data are random numbers; the file is damaged or wrongly decoded"
-            )
+        if (random := mosaic._random_share()) > 0.25:
+            said = "of the RAW data are random numbers; the file is damaged or wrongly decoded"
+            raise RawDecodeError(f"{random:.0%} {said}")
+        return mosaic
 
     def _random_share(self) -> float:
         """Share of the bands of rows that have high contrast, but no likeness of neighbouring pixels.
@@ -89,39 +76,33 @@ class Mosaic:
         Independent values differ by 2 / sqrt(pi) = 1.13 standard deviations on average, photographs by 0.5.
         """
         starts = range(0, len(self.values), _BAND)
-        scale = max(self.white - min(self.black), 1.0)
-        random = 0
+        scale, random = max(self.white - min(self.black), 1.0), 0
         for row in starts:
             band = self.values[row : row + _BAND].astype(np.float32)
-            if self.is_bayer:
-                deviation, steps = float(band.std()), band[:, 2:] - band[:, :-2]
-            else:  # greens that touch
+            steps, alike = band[:, 2:] - band[:, :-2], band
+            if self.period == 6:  # greens that touch
                 colours = self.colours[row : row + _BAND]
-                deviation = float(band[colours == _GREEN].std())
                 steps = np.diff(band, axis=1)[colours[:, 1:] == colours[:, :-1]]
-            step = float(np.abs(steps).mean()) if steps.size else 0.0
+                alike = band[colours == 1]
+            step, deviation = float(np.abs(steps).mean()) if steps.size else 0.0, float(alike.std())
             random += deviation > 0.15 * scale and step > 0.9 * deviation
         return random / len(starts)
 
     def repair(self) -> int:
         """Replace defective pixels in LibRaw's own memory, before it demosaics; return how many."""
-        return replace_defects(self.values, self.colours, 2 if self.is_bayer else 6)
+        return replace_defects(self.values, self.colours, self.period)
 
     def saturation(self) -> tuple[int, tuple[float, float, float]]:
         """Level at which the sensor clips, and that of each colour relative to it, where clipped pixels pile.
 
         The level that a file states is often too high, and the colours of some sensors differ.
         """
-        piles = {k: self._pile(k) for k in range(4) if self.is_bayer or k < 3}
-        ends = [pile[1] for pile in piles.values() if pile is not None]
-        white = min(max(ends), self.white) if ends else self.white
-        clip = [1.0, 1.0, 1.0]
-        for k, pile in piles.items():
-            if pile is not None:
-                channel = 1 if k == 3 else k
-                level = (pile[0] - self.black[k]) / max(white - self.black[k], 1.0)
-                clip[channel] = min(clip[channel], level)
-        return white, (clip[0], clip[1], clip[2])
+        piles = {k: pile for k in range(4) if (pile := self._pile(k)) is not None}
+        white = min(max((end for _, end in piles.values()), default=self.white), self.white)
+        clip = [1.0, 1.0, 1.0, 1.0]
+        for k, (start, _) in piles.items():
+            clip[k] = min(1.0, (start - self.black[k]) / max(white - self.black[k], 1.0))
+        return white, (clip[0], min(clip[1], clip[3]), clip[2])
 
     def _pile(self, colour: int) -> tuple[int, int] | None:
         """Lower and upper end of the pile of saturated pixels of one colour; `None` without one.
@@ -140,11 +121,8 @@ class Mosaic:
         pile, above = int(counts[low:high].sum()), int(counts[high:].sum())
         below = int(counts[max(2 * low - high, 0) : low].sum())
         # More than half of a colour in one pile is an even area of a drawing, not a clipped light.
-        if (
-            not max(50, 2e-5 * counts.sum()) < pile < 0.5 * counts.sum()
-            or pile < 5 * below
-            or above > _STRAYS * pile
-        ):
+        enough = max(50, 2e-5 * counts.sum()) < pile < 0.5 * counts.sum()
+        if not enough or pile < 5 * below or above > _STRAYS * pile:
             return None
         # what of the picture lies under the pile as it does below it does not belong to it
         inside = np.cumsum(counts[low:] - below / (high - low))
@@ -154,7 +132,7 @@ class Mosaic:
 
     def noise(self, white: int) -> PlaneNoise | None:
         """Measure the noise of the sensor in each colour, `white` being 1; `None` for X-Trans."""
-        if not self.is_bayer:
+        if self.period != 2:
             return None
         sites: dict[int, Plane] = {}  # of the second green as of the first
         for row, col in np.ndindex(2, 2):
@@ -163,16 +141,12 @@ class Mosaic:
             values = self.values[row::2, col::2].astype(np.float32)
             sites.setdefault(1 if colour == 3 else colour, (values - black) / (np.float32(white) - black))
         step = 1.0 / max(white - min(self.black), 1.0)
-        r, g, b = (estimate_noise(sites[k], step=step) for k in range(3))
-        return r, g, b
+        return tuple(estimate_noise(sites[k], step=step) for k in range(3))
 
     def bayer_pattern(self) -> BayerPattern | None:
         """Channel of each pixel of the top left 2 x 2; `None` for X-Trans."""
-        if not self.is_bayer:
-            return None
-        cell = self.colours[:2, :2]
-        (a, b), (c, d) = np.where(cell == 3, 1, cell).tolist()
-        return ((a, b), (c, d))
+        (a, b), (c, d) = np.where(self.colours[:2, :2] == 3, 1, self.colours[:2, :2]).tolist()
+        return ((a, b), (c, d)) if self.period == 2 else None
 
 
 # --- defective pixels --------------------------------------------------------------------------
@@ -250,8 +224,7 @@ def defects(near: Neighbours) -> Places:
     places = np.flatnonzero(_standing_out(near.values, near.offsets, near.width, least))
     ring = near.values[near.of(places)].astype(np.float32)
     middle = np.median(ring, axis=0)
-    sign = np.sign(near.values[places] - middle)
-    height = np.abs(near.values[places] - middle)
+    sign, height = np.sign(near.values[places] - middle), np.abs(near.values[places] - middle)
     apart = np.sort(np.abs(ring - middle), axis=0)
     sigma = np.maximum(np.interp(middle, levels, deviations), 1.4826 * apart[_NEIGHBOURS // 2])
     touching = [places + step for step in (-near.width, -1, 1, near.width)]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-from lensmodel.core.types import NoiseModel, Plane, Planes, block_means
+from lensmodel.core.types import NoiseModel, Plane, block_means
 
 BLOCK: Final = 8  # side of the blocks in pixels: flat places of this size exist in almost any photo
 GRAIN: Final = 4  # side of blocks whose means tell of coarse grain: fine grain averages out there (chosen)
@@ -24,7 +23,7 @@ _CUT_POWER: Final = 0.778465  # mean of min(z^2, _CUT^2) of a standard normal z
 
 # The difference of two Laplacians: unit gain for white noise, blind to planes and to edges
 # along the axes. J. Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, eq. 2.
-_HIGH_PASS: Final = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0
+_HIGH_PASS: Final = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32) / np.float32(6.0)
 
 
 def estimate_noise(
@@ -43,8 +42,10 @@ def estimate_noise(
     levels, variances, counts = _levels(_sampled(np.asarray(plane, dtype=np.float32)), clip).T
     if codes is not None and len(levels):
         variances = np.maximum(variances, np.interp(levels, codes, np.gradient(codes) ** 2 / 12.0))
-    model = _fit(levels, variances, counts)
-    return NoiseModel(model.shot, max(model.read, step * step / 12.0))
+    if len(levels) < 2:
+        return NoiseModel(0.0, max(float(variances.sum()), step * step / 12.0))
+    slope, offset = _line(levels, variances, counts)
+    return NoiseModel(slope, max(offset, step * step / 12.0))
 
 
 def coding_noise(coarseness: float, curve: NDArray[np.floating]) -> NoiseModel | None:
@@ -60,14 +61,6 @@ def coding_noise(coarseness: float, curve: NDArray[np.floating]) -> NoiseModel |
     variances = np.maximum((coarseness * widths) ** 2 / 12.0, 1e-16)
     design = np.stack([levels, np.ones_like(levels)], axis=1) / variances[:, None]
     return NoiseModel(*map(float, optimize.nnls(design, np.ones_like(levels))[0]))
-
-
-def grain_of(
-    planes: Planes, noise: Sequence[NoiseModel], clip: Sequence[float]
-) -> tuple[float, float, float]:
-    """`graininess` of each plane."""
-    r, g, b = (graininess(*of_plane) for of_plane in zip(planes, noise, clip, strict=True))
-    return r, g, b
 
 
 def graininess(plane: Plane, noise: NoiseModel, clip: float = 1.0) -> float:
@@ -99,27 +92,21 @@ def _levels(plane: Plane, clip: float) -> NDArray[np.float64]:
     """Mean, variance and number of pixels of each level that was seen flat, shape (n, 3)."""
     if min(plane.shape) < 3 * BLOCK:
         return np.zeros((0, 3))
-    high = ndimage.convolve(plane, _HIGH_PASS.astype(np.float32), mode="nearest")
     low = ndimage.gaussian_filter(plane, 2.0, mode="nearest", truncate=3.0)
-    blocks = _blocks(plane)
+    blocks, high = _blocks(plane), _blocks(ndimage.convolve(plane, _HIGH_PASS, mode="nearest"))
     mean, texture = blocks.mean(axis=1, dtype=np.float64), _blocks(low).std(axis=1, dtype=np.float64)
     usable = (blocks.max(axis=1) < 0.98 * clip) & ((blocks <= 0).mean(axis=1) < 0.02)
-    high_blocks = _blocks(high)
     # Areas without any change, painted or clipped by a program, tell nothing about the sensor.
-    usable &= np.ptp(high_blocks, axis=1) > 0
-    if usable.sum() < _MIN_BLOCKS:
-        return np.zeros((0, 3))
-    mean, texture, high_blocks = mean[usable], texture[usable], high_blocks[usable]
-    order = np.argsort(mean)
-    rows = []
-    for part in np.array_split(order, max(1, min(_BINS, len(order) // (4 * _MIN_BLOCKS)))):
+    usable = np.flatnonzero(usable & (np.ptp(high, axis=1) > 0))
+    order, rows = usable[np.argsort(mean[usable])], list[tuple[float, float, int]]()
+    levels = max(1, min(_BINS, len(order) // (4 * _MIN_BLOCKS)))
+    for part in np.array_split(order, levels) if len(order) >= _MIN_BLOCKS else []:
         keep = max(_MIN_BLOCKS, int(_FLAT_SHARE * len(part)))
         flat = part[np.argsort(texture[part])[:keep]]
-        values = high_blocks[flat]
-        sigma = _scale(values)
+        sigma = _scale(high[flat])
         if sigma > 0:  # else most differences are exactly 0: rounding or compression ate the noise
-            rows.append((float(mean[flat].mean()), sigma * sigma, float(values.size)))
-    return np.array(rows).reshape(-1, 3)
+            rows.append((float(mean[flat].mean()), sigma * sigma, high[flat].size))
+    return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 
 def _scale(values: NDArray[np.float32]) -> float:
@@ -144,18 +131,14 @@ def _blocks(plane: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.ascontiguousarray(cut.swapaxes(1, 2)).reshape(rows * cols, BLOCK * BLOCK)
 
 
-def _fit(
+def _line(
     levels: NDArray[np.float64], variances: NDArray[np.float64], counts: NDArray[np.float64]
-) -> NoiseModel:
-    """Weighted line through the levels, robust against those where no place is flat.
+) -> tuple[float, float]:
+    """Slope and offset of a line through the levels, robust against those where no place is flat.
 
     The error of a variance is proportional to the variance, so the weights are count / var^2;
     texture only ever adds, so points above the line lose weight, those below do not.
     """
-    if len(levels) == 0:
-        return NoiseModel(0.0, 0.0)
-    if len(levels) == 1:
-        return NoiseModel(0.0, float(variances[0]))
     # Three standard errors of a variance from the median deviation of pixels, every second of
     # which is independent after the high-pass.
     chance = 3.0 * np.sqrt(2.7 * 2.0 * 2.0 / counts)
@@ -166,4 +149,4 @@ def _fit(
         slope, offset = optimize.nnls(np.stack([levels * weight, weight], axis=1), variances * weight)[0]
         model = np.maximum(slope * levels + offset, 1e-16)
         trust = np.minimum(1.0, chance / np.maximum((variances - model) / model, chance)) ** 2
-    return NoiseModel(float(slope), float(offset))
+    return float(slope), float(offset)

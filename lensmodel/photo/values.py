@@ -182,7 +182,7 @@ class LinearPhoto:
     sensor_noise: PlaneNoise | None = None
     coding_noise: NoiseModel | None = None
     cfa: BayerPattern | None = None
-    grain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    grain: tuple[float, ...] = (1.0, 1.0, 1.0)
     chroma_step: tuple[int, int] = (1, 1)
     remarks: tuple[str, ...] = ()
 

@@ -31,7 +31,6 @@ from lensmodel.patches import Selector
 from lensmodel.photo import LinearPhoto, PhotoMetadata
 from lensmodel.photo.development import photo_from_array
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
-from lensmodel.photo.metadata import gps_directory
 from lensmodel.photo.values import CORRECTED, remarks_log
 
 log = logging.getLogger(__name__)
@@ -292,7 +291,6 @@ def correct(
     color_space: photo.ColorSpace = "same",
     quality: int = 95,
     least_gain_db: float | None = None,
-    keep_location: bool = False,
     workers: int | None = None,
     on_step: StepHook = ignore_step,
 ) -> correction.Corrected:
@@ -328,8 +326,6 @@ def correct(
         Of a JPEG, 1..100.
     least_gain_db : float, optional
         Write nothing where a lesser gain is expected (`Corrected.expected_gain_db`); None always writes.
-    keep_location : bool
-        Write where the photo was taken (GPS) into the corrected one too.
     workers : int, optional
         Threads; all cores by default. The result does not depend on it.
     on_step : callable
@@ -401,7 +397,6 @@ def correct(
         color_space=color_space,
         quality=quality,
         description=description,
-        gps=gps_directory(source) if keep_location and source is not None else {},
     )
     return corrected
 

@@ -24,8 +24,7 @@ from lensmodel.core.types import CHANNELS, Frame, LensSettings, NoiseModel, Plan
 from lensmodel.photo import colour, containers
 from lensmodel.photo.containers import COPY_AGAIN
 from lensmodel.photo.metadata import Said
-from lensmodel.photo.mosaic import Mosaic
-from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
+from lensmodel.photo.sensor import Mosaic, coding_noise, estimate_noise, graininess
 from lensmodel.photo.values import (
     Encoding,
     LensIdentity,
@@ -413,15 +412,13 @@ _TURNED: Final = (
 
 def _develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
     """Decode a picture and turn its numbers into linear light by its transfer curve."""
-    header, (pixels, transparent) = said.header, _read_pixels(path, said.header)
+    header, pixels = said.header, _read_pixels(path, said.header)
     height, width = pixels.shape[:2]
     if (height, width) != (info.height, info.width):
         raise errors.UnreadablePhotoError(
             f"the header says {info.width} x {info.height}, the decoder gave {width} x {height}; save it anew"
         )
     floating, depth, remarks = pixels.dtype.kind == "f", pixels.dtype.itemsize, list[str]()
-    if transparent:
-        remarks.append("its transparency is dropped")
     transfer, icc = _transfer_of(said, floating, remarks)
     if info.turned:
         remarks.append(_TURNED)
@@ -457,8 +454,8 @@ def _transfer_of(said: Said, floating: bool, remarks: list[str]) -> tuple[Transf
     return "linear" if floating else "icc" if declared else "srgb", declared
 
 
-def _read_pixels(path: Path, header: containers.Header) -> tuple[Pixels, bool]:
-    """Decode to numbers `(row, col, 3)`, and say whether alpha was dropped that was not opaque."""
+def _read_pixels(path: Path, header: containers.Header) -> Pixels:
+    """Decode to numbers `(row, col, 3)`; transparency is dropped."""
     name = header.kind.upper()
     try:
         if header.kind == "tiff":
@@ -473,8 +470,7 @@ def _read_pixels(path: Path, header: containers.Header) -> tuple[Pixels, bool]:
         else:
             with containers.opened_jpeg(containers.JpegSegments(path.read_bytes())) as image:
                 pixels = np.asarray(image.convert("RGB"))
-        alpha = pixels[:, :, -1] if pixels.ndim == 3 and pixels.shape[2] in {2, 4} else None
-        return _three_channels(pixels), alpha is not None and bool((alpha != alpha.max()).any())
+        return _three_channels(pixels)
     except (MemoryError, errors.LensModelError):
         raise
     except Exception as error:  # decoders meet hostile files with exceptions of any kind
@@ -489,13 +485,11 @@ def _three_channels(pixels: Pixels) -> Pixels:
         known = pixels[np.isfinite(pixels)]
         pixels = np.nan_to_num(pixels, posinf=max(1.0, float(known.max(initial=0.0))), neginf=0.0)
     elif pixels.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
-        raise errors.UnsupportedFormatError(
-            f"samples of type {pixels.dtype} are not read; save it with 8 or 16 bits"
-        )
+        said = f"samples of type {pixels.dtype} are not read; save it with 8 or 16 bits"
+        raise errors.UnsupportedFormatError(said)
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.ndim != 3 or pixels.shape[2] > 4:
-        raise errors.UnsupportedFormatError(
-            f"a picture of shape {pixels.shape} is no photo; give RGB on one page"
-        )
+        said = f"a picture of shape {pixels.shape} is no photo; give RGB on one page"
+        raise errors.UnsupportedFormatError(said)
     return np.repeat(pixels[:, :, :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[:, :, :3]

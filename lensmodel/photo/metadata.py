@@ -20,14 +20,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
-from pathlib import Path
 from typing import Final, TypeAlias
 from xml.sax.saxutils import quoteattr, unescape
 
 from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo import containers
 from lensmodel.photo.containers import ASCII, RATIONAL, Buffer, Header, Tag, Tags, TiffReader, Value, Written
-from lensmodel.photo.values import SOFTWARE, LensIdentity, Limits, PhotoMetadata, SerialSource
+from lensmodel.photo.values import SOFTWARE, LensIdentity, PhotoMetadata, SerialSource
 
 _PLACEHOLDER: Final = re.compile(
     r"[0.\-_ x?]*|(.)\1{5,}|none|no lens|n/?a|unknown|null|manual", re.IGNORECASE
@@ -410,20 +409,6 @@ def find_location(buffer: Buffer) -> tuple[list[Overwrite], bool]:
     spans = [(at, data) for at, data in spans if bytes(buffer[at : at + len(data)]) != data]
     complete = len(blocks) <= MAX_BLOCKS and len(words) <= MAX_WORDS
     return _with_checksums(buffer, chunks, spans), complete
-
-
-def gps_directory(path: Path) -> dict[int, Value]:
-    """Read the GPS directory of a photo, to be written into another file of it; empty without one."""
-    with containers.opened_header(path, Limits()) as header:
-        for reader in header.tiff:
-            gps, values = reader.below(reader.directory(reader.first)[0], containers.GPS), dict[int, Value]()
-            for tag, entry in gps.items():
-                numbers = gps.numbers(tag)  # of texts none
-                if tag < MAX_TAGS and entry.size <= MAX_VALUE and all(map(math.isfinite, numbers)):
-                    values[tag] = entry.kind, numbers or gps.raw(tag)
-            if values:
-                return values
-    return {}
 
 
 def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[Overwrite]:

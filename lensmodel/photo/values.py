@@ -42,7 +42,7 @@ _PROCESSED: Final = 16.0  # noise variance of a photo without its mosaic over wh
 _USUAL_GRAIN, _COARSEST = 14.0, 4.0
 # Noise power of demosaiced planes at low frequencies over that of the sensor: see `development._NOISE_MIX`.
 _DEMOSAICED: Final = (3.7, 1.9, 3.7)
-_COARSEST_POWER: Final = 64.0  # largest `noise.graininess` believed: cameras reach 60, texture far more
+_COARSEST_POWER: Final = 64.0  # largest `sensor.graininess` believed: cameras reach 60, texture far more
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +166,7 @@ class LinearPhoto:
         Which pixels of each plane were measured, and not filled in by demosaicing. `None` where
         the planes are no longer on the sensor's grid, or there was no Bayer mosaic.
     grain : tuple of float
-        How much coarser than white the noise of each plane is: see `noise.graininess`.
+        How much coarser than white the noise of each plane is: see `sensor.graininess`.
     chroma_step : tuple of int
         Rows and columns of pixels that share one value of chroma: (2, 2) in most JPEGs.
     remarks : tuple of str

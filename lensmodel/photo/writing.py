@@ -51,15 +51,13 @@ def write_image(
     quality: int = 95,
     description: str = "",
     lens: str = "",
-    gps: Written | None = None,
 ) -> None:
     """Write planes as a file that shows the picture as its input did, complete or not at all.
 
-    It never carries maker notes or serials, and the place only where its owner wants it (`gps`). Light is
-    clipped to 0..1 but in "tiff32". TIFF, JPEG and DNG keep the sensor orientation and say how to turn it;
-    PNG, where programs ignore that, is written upright. The colour space "same" is profile and curve of the
-    input, and for RAW sRGB with the camera's white balance; "camera-linear", as in DNG, the planes' own
-    numbers.
+    It never carries maker notes, serials or the place. Light is clipped to 0..1 but in "tiff32". TIFF, JPEG
+    and DNG keep the sensor orientation and say how to turn it; PNG, where programs ignore that, is written
+    upright. The colour space "same" is profile and curve of the input, and for RAW sRGB with the camera's
+    white balance; "camera-linear", as in DNG, the planes' own numbers.
     """
     if planes.ndim != 3 or planes.shape[0] != 3:
         raise InvalidInputError(f"planes must have the shape (3, height, width), got {planes.shape}")
@@ -73,9 +71,10 @@ def write_image(
     path, metadata = Path(path), encoding.metadata.without_serials()
     if format.startswith("png"):
         metadata = replace(metadata, orientation=1)
-    tags = {**written_tags(metadata, description), containers.GPS: gps or {}}
-    xmp = xmp_packet(metadata, description, lens)
-    _tell_losses(path.name, planes, encoding, format)
+    tags, xmp = written_tags(metadata, description), xmp_packet(metadata, description, lens)
+    if (encoding.opcodes_2 or encoding.opcodes_3) and format != "dng":
+        said = "%s: what the DNG leaves to raw converters to correct is not in it; only DNG output keeps that"
+        remarks_log.warning(said, path.name)
     linear = format == "tiff32" and color_space == "same" and encoding.transfer == "linear"
     target = _target(encoding, "camera-linear" if linear or format == "dng" else color_space)
     pixels = _encoded(planes, target, {"tiff32": None, "jpeg": 255, "png8": 255}.get(format, 65535))
@@ -96,17 +95,6 @@ def write_image(
             of_rgb: Written = {262: (SHORT, 2), 339: numbers, _ICC_TAG: (UNDEFINED, target.icc)}
             tags |= _linear_dng_tags(encoding) if format == "dng" else of_rgb
             write_strip(file, {**tags, _XMP_TAG: (BYTE, xmp)}, pixels)
-
-
-def _tell_losses(name: str, planes: Planes, encoding: Encoding, output: OutputFormat) -> None:
-    """Tell what of the photo a file of this format does not hold."""
-    if (encoding.opcodes_2 or encoding.opcodes_3) and output != "dng":
-        said = "%s: what the DNG leaves to raw converters to correct is not in it; only DNG output keeps that"
-        remarks_log.warning(said, name)
-    clipped = encoding.bit_depth == 32 and output not in {"tiff32", "dng"}
-    if clipped and (beyond := 100.0 * float((planes > 1.0).mean())):
-        said = "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them"
-        remarks_log.warning(said, name, beyond)
 
 
 # --- colour ------------------------------------------------------------------------------------

@@ -24,13 +24,12 @@ import rawpy
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps
-from PIL.TiffImagePlugin import IFDRational
 
 from lab.images import to_srgb
 from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
-from lensmodel.photo.metadata import gps_directory, xmp_packet
+from lensmodel.photo.metadata import xmp_packet
 from lensmodel.photo.writing import XYZ_TO_SRGB, opcodes_of_planes, write_bayer_dng
 
 METADATA = photo.PhotoMetadata(
@@ -450,26 +449,6 @@ def test_copyright_and_artist_of_xmp_are_kept(output: photo.OutputFormat, tmp_pa
     said = photo.inspect(corrected(tmp_path / "x.jpg", tmp_path / "out", output)).metadata
 
     assert (said.copyright, said.artist) == ("© Ä. Example", "Ä. Example")
-
-
-@pytest.mark.parametrize("output", [*FORMATS, "tiff32"])
-@pytest.mark.parametrize("order", ["big", "little"])
-def test_the_place_is_kept_where_its_owner_wants_it_and_nowhere_else(
-    output: photo.OutputFormat, order: str, tmp_path: Path
-) -> None:
-    block = Image.Exif()
-    block.endian = ">" if order == "big" else "<"
-    place = (IFDRational(52), IFDRational(30), IFDRational(1234, 100))
-    block.get_ifd(0x8825).update({0: b"\2\3\0\0", 1: "N", 2: place, 3: "E", 4: place, 5: b"\0"})
-    Image.new("RGB", (64, 48), "grey").save(tmp_path / "x.jpg", exif=block)
-
-    kept = corrected(tmp_path / "x.jpg", tmp_path / "kept", output, gps=gps_directory(tmp_path / "x.jpg"))
-    left = corrected(tmp_path / "x.jpg", tmp_path / "left", output)
-
-    found = gps_directory(kept)
-    assert found == gps_directory(tmp_path / "x.jpg")
-    assert found[2] == (5, (52.0, 30.0, 12.34))
-    assert gps_directory(left) == {}
 
 
 def opcode_lists(path: Path) -> list[bytes]:

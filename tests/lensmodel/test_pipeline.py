@@ -53,7 +53,8 @@ def test_developed_photo_comes_back_from_disk_as_it_was(city: LinearPhoto, tmp_p
     assert np.array_equal(back.planes, city.planes)
     assert back.planes.flags.writeable is False
     assert (back.frame, back.noise, back.clip) == (city.frame, city.noise, city.clip)
-    assert (back.info, back.encoding) == (city.info, city.encoding)
+    assert back.info == city.info
+    assert to_json(back.encoding) == to_json(city.encoding)
 
 
 def test_half_written_folder_is_no_developed_photo(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Train the learned choice of patches (`lensmodel.patches.good_regions`).
+"""Train the learned choice of patches (`lensmodel.patches.select`).
 
     python -m lab.training.train_regions collect PHOTOS TABLE.jsonl [GROUPS [METHOD]]
     python -m lab.training.train_regions fit TABLE.jsonl MODEL.npz
@@ -27,9 +27,7 @@ from lab.cases import list_photos, photo_half, scene_of
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import FieldPosition, Frame, LensSettings, NoiseModel, ignore_step
-from lensmodel.patches.good_regions import FEATURES, features_of
-from lensmodel.patches.rmap import RMapSelector
-from lensmodel.patches.select import first_reasons
+from lensmodel.patches.select import FEATURES, RMapSelector, features_of, first_reasons
 from lensmodel.patches.windows import BLOCKS_A_SIDE, details_of, windows_of
 from lensmodel.simulate import draw_lens
 

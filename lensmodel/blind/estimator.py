@@ -13,7 +13,6 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, centred, resized
 from lensmodel.core.types import Kernel, LensSettings, NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.patches import Patch, Selection
-from lensmodel.patches.windows import periodogram, repeats
 from lensmodel.photo.values import LinearPhoto
 
 _MIN_SIDE = 64  # pixels: one tile of a patch's spectrum
@@ -29,14 +28,11 @@ class PsfEstimate:
     ----------
     kernel : Kernel, float64, shape (size, size)
         Of sum 1, on the pixel grid of the patches.
-    confidence : float
-        0..1; ranks estimates by their true error.
     predicted_error : float
-        Expected relative L2 distance to the true kernel.
+        Expected relative L2 distance to the true kernel; the larger, the less an estimate counts.
     """
 
     kernel: Kernel
-    confidence: float
     predicted_error: float
 
 
@@ -146,17 +142,15 @@ def _unfit(patch: Plane, model: NoiseModel) -> str | None:
     steps = 0.5 * float(np.var(np.diff(patch, axis=0)) + np.var(np.diff(patch, axis=1)))
     if steps > 1.4 * float(patch.var()):
         return "noise"
-    if repeats(periodogram(patch - patch.mean()), sigma**2, patch.shape):
-        return "periodic"
     return None
 
 
-def confidence_of(error: float) -> float:
-    """Confidence of an estimate with an expected relative L2 error; 1/2 at a usual one, 0.4 (chosen)."""
+def weight_of(error: float) -> float:
+    """Weight of an estimate with an expected relative L2 error; 1/2 at a usual one, 0.4 (chosen)."""
     return 1.0 / (1.0 + (error / 0.4) ** 2)
 
 
 def finished(kernel: Kernel, *, size: int, error: float) -> PsfEstimate:
-    """Centre a kernel of any odd side and say how sure it is by its expected relative L2 error."""
+    """Centre a kernel of any odd side, of an expected relative L2 error."""
     error = min(max(error, 0.0), 1.0) if math.isfinite(error) else 1.0
-    return PsfEstimate(resized(centred(kernel), size), confidence_of(error), error)
+    return PsfEstimate(resized(centred(kernel), size), error)

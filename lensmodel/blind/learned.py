@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.blind.estimator import PsfEstimate, confidence_of, finished, usable
+from lensmodel.blind.estimator import PsfEstimate, finished, usable, weight_of
 from lensmodel.core.psf import EncodedPatch, PatchKind, PsfSample, centred, resized, support_radius
 from lensmodel.core.types import (
     CHANNELS,
@@ -89,7 +89,7 @@ class LearnedEstimator:
                         kernel=centred(resized(kernel, side)),
                         position=patch.position,
                         settings=settings.with_channel(channel),
-                        weight=confidence_of(float(error)),
+                        weight=weight_of(float(error)),
                         photo=photo,
                         pixel_pitch_um=developed.info.metadata.pixel_pitch_um,
                         estimator=f"{self.name}/{self.version}",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import itertools
 import json
 import logging
 import math
@@ -22,9 +23,9 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from lensmodel import patches, photo
+from lensmodel import photo
 from lensmodel.blind import PhotoEstimator, PsfEstimate, PsfEstimator, estimators
-from lensmodel.blind.estimator import require_size
+from lensmodel.blind.estimator import require_size, weight_of
 from lensmodel.core import processes
 from lensmodel.core.errors import (
     InvalidInputError,
@@ -36,7 +37,8 @@ from lensmodel.core.errors import (
 from lensmodel.core.files import from_json, save_array, to_json
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, Channel, LensSettings, StepHook, ignore_step
-from lensmodel.patches import Patch, Selection, Selector
+from lensmodel.patches import Patch, Selection, Selector, select, selectors
+from lensmodel.patches.select import LEAST_PARTS, LEAST_PATCHES, SMALLEST_PATCH, require_enough
 from lensmodel.photo import LinearPhoto, PhotoMetadata
 
 log = logging.getLogger(__name__)
@@ -92,7 +94,7 @@ def configured(
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     config = replace(preset, selector=selector, settings=settings, **given)
     require_size(config.kernel_size)
-    patches.selectors.resolve(selector)
+    selectors.resolve(selector)
     if config.patches < 1:
         raise InvalidInputError(f"patches must be at least 1, got {config.patches}")
     return config
@@ -147,8 +149,8 @@ def find_patches(
         require_spread(selection.patches, count=count)
         return selection
     third = (min(developed.frame.height, developed.frame.width) // 3) // 2 * 2
-    size = min(_PATCH_SIZE, max(third, patches.SMALLEST_PATCH))
-    selection = patches.select(
+    size = min(_PATCH_SIZE, max(third, SMALLEST_PATCH))
+    selection = select(
         developed.planes[1],
         developed.noise[1],
         developed.frame,
@@ -161,21 +163,19 @@ def find_patches(
         on_step=on_step,
     )
     # the selector makes cells of about three patches: of few that were asked for, few lie apart
-    patches.require_enough(selection.patches, least=min(patches.LEAST_PATCHES, math.ceil(count / 3)))
+    require_enough(selection.patches, least=min(LEAST_PATCHES, math.ceil(count / 3)))
     return selection
 
 
 def require_spread(determined: Sequence[Patch], *, count: int) -> None:
     """Refuse a photo of whose patches too few gave a PSF: three parts of the picture must be left."""
-    patches.require_enough(determined, least=min(patches.LEAST_PARTS, math.ceil(count / 3)))
+    require_enough(determined, least=min(LEAST_PARTS, math.ceil(count / 3)))
 
 
 def patches_by_cell(selection: Selection) -> list[tuple[Patch, ...]]:
     """Group accepted patches by field cell, the unit of work, largest groups first."""
-    grouped: dict[int, list[Patch]] = {}
-    for patch in selection.patches:
-        grouped.setdefault(patch.cell, []).append(patch)
-    return [tuple(group) for _, group in sorted(grouped.items(), key=lambda item: (-len(item[1]), item[0]))]
+    groups = (tuple(group) for _, group in itertools.groupby(selection.patches, lambda patch: patch.cell))
+    return sorted(groups, key=len, reverse=True)
 
 
 def estimate_cell(
@@ -190,7 +190,7 @@ def estimate_cell(
 ) -> list[PsfSample]:
     """Estimate the PSF of one field cell in each channel, green first, of a photo or the folder of one.
 
-    The patches of a cell share one kernel, and their weights add up to its confidence; an estimator of whole
+    The patches of a cell share one kernel, and their weights add up to one; an estimator of whole
     photos has all patches in one cell and gives each its own.
     """
     developed = load_developed(developed) if isinstance(developed, Path) else developed
@@ -216,16 +216,17 @@ def estimate_cell(
             continue
         if channel == "g":
             green = estimate
+        error = estimate.predicted_error if math.isfinite(estimate.predicted_error) else None
         samples += [
             PsfSample(
                 kernel=estimate.kernel,
                 position=patch.position,
                 settings=settings.with_channel(channel),
-                weight=float(np.clip(estimate.confidence / len(group), 0.0, 1.0)),
+                weight=weight_of(1.0 if error is None else error) / len(group),
                 photo=photo_id,
                 pixel_pitch_um=developed.info.metadata.pixel_pitch_um,
                 estimator=f"{method.name}/{method.version}",
-                error=estimate.predicted_error if math.isfinite(estimate.predicted_error) else None,
+                error=error,
                 half_diagonal_px=developed.frame.half_diagonal,
             )
             for patch in group

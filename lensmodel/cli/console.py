@@ -216,6 +216,11 @@ def aperture(words: str) -> Any:  # noqa: ANN401 - what `typer.Option` returns
     return typer.Option("--aperture", "-a", metavar="N", parser=f_number, help=words)
 
 
+def output(words: str) -> Any:  # noqa: ANN401 - what `typer.Option` returns
+    """Return the option of what to write."""
+    return typer.Option("--output", "-o", metavar="DIR|FILE", help=words)
+
+
 Photos = Annotated[list[Path], typer.Argument(metavar="PHOTO", help="Photos, or folders of them.")]
 Profile = Annotated[Path, typer.Option("--profile", "-p", help="The lens profile to write or add to.")]
 ProfileFile = Annotated[Path, typer.Argument(metavar="FILE", help="The lens profile.")]
@@ -230,13 +235,5 @@ Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only errors: no progress and no notes.")]
 Verbose = Annotated[
-    int,
-    typer.Option(
-        "--verbose",
-        "-v",
-        count=True,
-        metavar="",
-        help="Say more; given twice, everything.",
-        show_default=False,
-    ),
+    int, typer.Option("--verbose", "-v", count=True, metavar="", show_default=False, help="More; -vv: all.")
 ]

@@ -42,8 +42,9 @@ LEARN_FROM: Final = 8
 _UNSURE: Final = 0.5
 # Facts of a corrected photo that its result repeats
 _FOUND: Final = ("expected_gain_db", "zones", "nothing_to_correct", "audit", "chroma_step")
-# Panels of the options that few people need
-LEARNING, CORRECTING = "Learning (--lens auto)", "Correcting"
+# options that few people need, in panels of their own
+learning = partial(typer.Option, rich_help_panel="Learning (--lens auto)")
+correcting = partial(typer.Option, rich_help_panel="Correcting")
 
 
 def correct(
@@ -57,13 +58,7 @@ def correct(
     ] = None,
     output: Annotated[
         str | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="DIR|FILE",
-            help="Where to write: a folder, or for one photo a file such as sharp.tif. Default: a folder "
-            "`corrected` beside each photo.",
-        ),
+        console.output("A folder, or for one photo a file; default: a folder `corrected` beside each photo."),
     ] = None,
     strength: Annotated[float, typer.Option(min=0.0, max=1.0, help="1: all that the noise allows.")] = 1.0,
     file_format: Annotated[
@@ -79,34 +74,23 @@ def correct(
     quiet: console.Quiet = False,
     verbose: console.Verbose = 0,
     profiles: Annotated[
-        Path | None,
-        typer.Option(
-            rich_help_panel=LEARNING, help="Folder of lens profiles; default: `lenses` in the output."
-        ),
+        Path | None, learning(help="Folder of lens profiles; default: `lenses` in the output.")
     ] = None,
     learn_from: Annotated[
-        int, typer.Option(min=1, rich_help_panel=LEARNING, help="Most photos that a group is learned from.")
+        int, learning(min=1, help="Most photos that a group is learned from.")
     ] = LEARN_FROM,
     method: Annotated[
-        str | None,
-        typer.Option(
-            rich_help_panel=CORRECTING, help=f"{', '.join(deconvolvers)}; default: as the lens was learned."
-        ),
+        str | None, correcting(help=f"{', '.join(deconvolvers)}; default: as the lens was learned.")
     ] = None,
     halo: Annotated[
         float | None,
-        typer.Option(
-            rich_help_panel=CORRECTING,
-            help="How far results may go beyond the photo's own range beside edges, as a share of that "
-            "range: 0 for not at all, inf for no limit. Default: less, the less certain the profile is.",
+        correcting(
+            help="How far results may exceed the photo's own range beside edges, as a share of it: 0 not at "
+            "all, inf without limit. Default: less, the less certain the profile is."
         ),
     ] = None,
-    texture: Annotated[
-        float, typer.Option(rich_help_panel=CORRECTING, help="Share of its faint texture that a photo keeps.")
-    ] = 1.0,
-    denoise: Annotated[
-        float, typer.Option(rich_help_panel=CORRECTING, help="Share of the photo's grain to take away.")
-    ] = 0.0,
+    texture: Annotated[float, correcting(help="Share of its faint texture that a photo keeps.")] = 1.0,
+    denoise: Annotated[float, correcting(help="Share of the photo's grain to take away.")] = 0.0,
 ) -> None:
     """Remove the blur of the lens from photos.
 
@@ -145,8 +129,8 @@ def correct(
         }
     correction = Correction(targets, given, profile is None, any_lens, force, shown)
     if profile is None:
-        base = next(iter(targets.values())).parent
-        document = correct_groups(correction, profiles or base / PROFILES, learn_from)
+        profiles = profiles or next(iter(targets.values())).parent / PROFILES
+        document = correct_groups(correction, profiles, learn_from)
     else:
         known = Lens(files.profile_at(profile))
         document = {"profile": str(profile), "results": correction.photos(list(targets), known)}

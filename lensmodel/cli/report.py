@@ -25,13 +25,7 @@ FORMS: Final = (".pdf", ".png", ".csv", ".json")
 def report(
     profile: console.ProfileFile,
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="DIR|FILE",
-            help=f"Where to write: a folder for all of {', '.join(FORMS)}, or one such file.",
-        ),
+        Path | None, console.output(f"A folder for all of {', '.join(FORMS)}, or one such file.")
     ] = None,
     aperture: Aperture = None,
     against: Annotated[Path | None, typer.Option(help="Profile of another copy to compare with.")] = None,
@@ -45,9 +39,7 @@ def report(
 
         lensmodel report my-24mm.lensprofile
 
-        lensmodel report my-24mm.lensprofile --aperture 2 -o my-24mm-report
-
-        lensmodel report my-24mm.lensprofile -o my-24mm.pdf
+        lensmodel report my-24mm.lensprofile --aperture 2 -o my-24mm.pdf
 
         lensmodel report my-24mm.lensprofile --against a-friends-24mm.lensprofile
 
@@ -116,10 +108,7 @@ def _written(found: LensReport, form: str) -> bytes:
 
 def export(
     profile: console.ProfileFile,
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", help=f"Where to write: a file that ends in .{', .'.join(EXPORTERS)}."),
-    ],
+    output: Annotated[Path, console.output(f"A file that ends in .{', .'.join(EXPORTERS)}.")],
     aperture: Aperture = None,
     channel: console.Channel = "g",
     rows: Annotated[int, typer.Option(min=1, max=100, help="Rows of the grid of places.")] = 5,
@@ -147,13 +136,7 @@ def export(
         model = files.profile_at(profile).model
         with files.as_usage():
             settings = widest(model) if aperture is None else LensSettings(aperture=aperture)
-        psfs = psf_grid(
-            model,
-            settings.with_channel(channel),
-            rows=rows,
-            cols=cols,
-            size=size,
-            aspect=filled_aspect(model),
-        )
+        settings, aspect = settings.with_channel(channel), filled_aspect(model)
+        psfs = psf_grid(model, settings, rows=rows, cols=cols, size=size, aspect=aspect)
     write_atomically(output, EXPORTERS[file_format](psfs))
     shown.result(str(output))

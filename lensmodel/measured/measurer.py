@@ -344,26 +344,28 @@ class Window:
         own = self.noise.shot * np.maximum(self.light, 0.0) + self.noise.read
         return np.full(own.shape, float(own[self.measured].mean()) if self.measured.any() else 1.0)
 
+    def solved(self, latent: NDArray[np.floating], size: int, *, varying: bool = False) -> Solved:
+        """Find the kernel behind which a latent picture is this window."""
+        return solve(self.light, latent, self.measured, self.variance, size, varying=varying)
+
 
 def window_psf(
     window: Window, latent: Latent, size: int, *, varying: bool = False
 ) -> tuple[Solved, tuple[float, float]]:
     """Measure the PSF of one window; say also how far the latent picture was moved.
 
-    First a small kernel, whose centre of mass says how far the photo lies beyond the latent picture; that
-    is moved, and solved again, so that the kernel comes out nearly centred and needs no interpolation, which
-    would soften a peak as narrow as a pixel.
+    Moved by what a small kernel is off, the latent picture gives a kernel that is nearly centred and needs no
+    interpolation, which would soften a peak as narrow as a pixel.
     """
     _, shift = roughly(window, latent, min(SMALL, size))
-    given = window.light, latent(shift, size // 2), window.measured, window.variance, size
-    return solve(*given, varying=varying), shift
+    return window.solved(latent(shift, size // 2), size, varying=varying), shift
 
 
 def roughly(window: Window, latent: Latent, size: int = SMALL) -> tuple[Kernel, tuple[float, float]]:
     """Find a small kernel of a window, and how far the photo lies beyond the latent picture."""
     shift = (0.0, 0.0)
     for _ in range(2):
-        first = solve(window.light, latent(shift, size // 2), window.measured, window.variance, size)
+        first = window.solved(latent(shift, size // 2), size)
         shift = shift[0] + first.shift[0], shift[1] + first.shift[1]
         if max(map(abs, shift)) > _MOST_SHIFT:
             raise NotEnoughEvidenceError("the window lies elsewhere than the rest of the reference says")

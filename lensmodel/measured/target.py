@@ -31,6 +31,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import ClassVar, Final
 
@@ -43,17 +44,8 @@ from scipy.signal.windows import tukey
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.files import atomic
 from lensmodel.core.types import Channel, Kernel, StepHook
-from lensmodel.measured.measurer import (
-    SMALL,
-    Found,
-    Measurer,
-    Prepared,
-    Window,
-    roughly,
-    window_corners,
-    window_psf,
-    window_terms,
-)
+from lensmodel.measured import measurer
+from lensmodel.measured.measurer import SMALL, Found, Measurer, Prepared, Window
 from lensmodel.measured.registration import CLEAR, Warp, find_marks, homography_of, match, matched
 from lensmodel.photo import LinearPhoto
 
@@ -220,7 +212,9 @@ class Target(Measurer):
         across = min(self.across, max(width // (3 * self.side // 4), 2))
         held = [
             corner
-            for corner in window_corners((height, width), self.side, _TRIED * across, _TRIED * down, 0)
+            for corner in measurer.window_corners(
+                (height, width), self.side, _TRIED * across, _TRIED * down, 0
+            )
             if placed.holds(*corner, self.side, size // 2)
         ]
         if not held:
@@ -240,44 +234,42 @@ class Target(Measurer):
     def find(self, photo: LinearPhoto, on_step: StepHook) -> PlacedPage:
         """Find the page in a photo and register it to a fraction of a pixel."""
         plane, side = np.asarray(photo.planes[1]), self.side
-        placed = _identified(photo, self.details, on_step)
-        corners = [at for at in window_corners(plane.shape, side, 12, 8, 0) if placed.holds(*at, side, 0)]
+        placed = self._identified(photo, on_step)
+        corners = measurer.window_corners(plane.shape, side, 12, 8, 0)
+        corners = [corner for corner in corners if placed.holds(*corner, side, 0)]
         warp = placed.warp
+
+        def shown(bent: Warp, corner: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float32]:
+            return replace(placed, warp=bent).window(*corner, shape)
+
         for degree in (1, 3, 5, 5):
-            warp = matched(
-                warp, lambda bent, at, shape: replace(placed, warp=bent).window(*at, shape),
-                plane, corners, side, degree, on_step,
-            )  # fmt: skip
+            warp = matched(warp, shown, plane, corners, side, degree, on_step)
         return replace(placed, warp=warp)
 
-
-def _identified(photo: LinearPhoto, details: Sequence[int], on_step: StepHook) -> PlacedPage:
-    """Say which page it is and which way up, by the noise near the middle of the page."""
-    best: tuple[float, PlacedPage] | None = None
-    plane, side = photo.planes[1], _SIDE
-    marks = find_marks(plane)
-    middle = marks.mean(axis=0)
-    row, col = np.rint(middle - side / 2).astype(int)
-    if min(row, col) < 0 or row + side > plane.shape[0] or col + side > plane.shape[1]:
-        raise NotEnoughEvidenceError(_TOO_SMALL)
-    for detail in details:
-        page = TargetPage(detail)
-        for turn in range(4):
+    def _identified(self, photo: LinearPhoto, on_step: StepHook) -> PlacedPage:
+        """Say which page it is and which way up, by the noise near the middle of the page."""
+        best: tuple[float, PlacedPage] | None = None
+        plane = photo.planes[1]
+        marks = find_marks(plane)
+        middle = marks.mean(axis=0)
+        row, col = np.rint(middle - _SIDE / 2).astype(int)
+        seen = plane[max(row, 0) : row + _SIDE, max(col, 0) : col + _SIDE]
+        if seen.shape != (_SIDE, _SIDE):
+            raise NotEnoughEvidenceError(_TOO_SMALL)
+        for page, turn in product(map(TargetPage, self.details), range(4)):
             on_step(0, 1)
             warp = Warp(homography_of(np.roll(marks, -turn, axis=0), page.marks), photo.frame)
-            if not 0.3 < warp.scale(*middle) < 3.0:
-                break  # no turn makes noise visible that pixels do not resolve
-            placed = PlacedPage(page, warp)
-            shown = placed.window(row, col, (side, side))
-            _, clarity = match(plane[row : row + side, col : col + side], shown)
-            if best is None or clarity > best[0]:
-                best = clarity, placed
-    if best is None or best[0] < CLEAR:
-        raise NotEnoughEvidenceError(
-            "no known target is seen; photograph the page that `lensmodel target` writes, printed without "
-            "stretching it, whole and in focus"
-        )
-    return best[1]
+            if 0.3 < warp.scale(*middle) < 3.0:  # else pixels do not resolve the noise
+                placed = PlacedPage(page, warp)
+                _, clarity = match(seen, placed.window(row, col, seen.shape))
+                if best is None or clarity > best[0]:
+                    best = clarity, placed
+        if best is None or best[0] < CLEAR:
+            raise NotEnoughEvidenceError(
+                "no known target is seen; photograph the page that `lensmodel target` writes, printed "
+                "without stretching it, whole and in focus"
+            )
+        return best[1]
 
 
 def _spread(held: Sequence[tuple[int, int]], across: int, down: int) -> list[tuple[int, int]]:
@@ -339,12 +331,12 @@ def _solved(
         return placed.window(row - margin - shift[0], col - margin - shift[1], outer)
 
     def lit(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
-        return page(shift, margin) * (window_terms(side, margin) @ light)
+        return page(shift, margin) * (measurer.window_terms(side, margin) @ light)
 
     light = np.eye(6)[0]
-    rough, shift = roughly(window, lit)
+    rough, shift = measurer.roughly(window, lit)
     light = _fitted_light(window, page(shift, SMALL // 2), rough)
-    solved, shift = window_psf(window, lit, size, varying=True)
+    solved, shift = measurer.window_psf(window, lit, size, varying=True)
     return solved.kernel, solved.error, shift, light
 
 
@@ -376,7 +368,7 @@ def _tones_in(window: Window, placed: PlacedPage) -> tuple[NDArray[np.float64], 
     """Precision (2, 2) and value (2,) of (q, c) in one window."""
     side, half, (row, col), good = len(window.light), SMALL // 2, window.corner, window.measured
     kernel, _, shift, terms = _solved(window, placed, SMALL)
-    light, outer = window_terms(side, half) @ terms, (side + 2 * half,) * 2
+    light, outer = measurer.window_terms(side, half) @ terms, (side + 2 * half,) * 2
     start = row - half - shift[0], col - half - shift[1]
     pages = [replace(placed, tones=tones).window(*start, outer) * light for tones in _POWERS]
     basis, terms = _explained(window, pages, kernel)
@@ -394,9 +386,9 @@ def _fitted_light(window: Window, page: NDArray[np.floating], kernel: Kernel) ->
     side = len(window.light)
     if int(window.measured.sum()) < _FEWEST:
         raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
-    lit = page * np.moveaxis(window_terms(side, len(kernel) // 2), -1, 0)
+    lit = page * np.moveaxis(measurer.window_terms(side, len(kernel) // 2), -1, 0)
     terms = _explained(window, lit, kernel)[1][:6]
-    light = window_terms(side) @ terms
+    light = measurer.window_terms(side) @ terms
     if not float(light.min()) > 0.0:
         raise NotEnoughEvidenceError("a window of the page is black, or does not show the page; light it")
     return np.asarray(terms / float(light.mean()))
@@ -407,5 +399,5 @@ def _explained(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Columns of blurred pages and of light laid over them at the measured pixels, and the share of each."""
     blurred = [signal.fftconvolve(page, kernel, mode="valid")[window.measured] for page in pages]
-    basis = np.column_stack([*blurred, window_terms(len(window.light))[window.measured]])
+    basis = np.column_stack([*blurred, measurer.window_terms(len(window.light))[window.measured]])
     return basis, np.linalg.lstsq(basis, window.light[window.measured], rcond=None)[0]

@@ -1,19 +1,15 @@
-"""The r-map of Xu and Jia: where gradients add up to edges, and where they cancel; and the selector by it."""
+"""The r-map of Xu and Jia: where gradients add up to edges, and where they cancel."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.types import Plane
-
-if TYPE_CHECKING:  # they import this module
-    from lensmodel.patches.windows import Details, Windows
 
 SMOOTHING_PX: Final = 1.0  # of the Gaussian before every gradient: noise would enter r's denominator
 FLAT_CONSTANT: Final = 0.5  # suppresses flat regions, for intensities of 0..1 (Xu and Jia)
@@ -73,26 +69,3 @@ def automatic_threshold(histogram: NDArray[np.int64], pixels: int, kernel_pixels
     kept = histogram[:, ::-1].cumsum(axis=1)[:, ::-1]
     enough = np.flatnonzero((kept >= wanted).all(axis=0))
     return int(enough[-1]) if enough.size else 0
-
-
-@dataclass(frozen=True, slots=True)
-class RMapSelector:
-    """Edges in every direction where the r-map is high, and signal at every frequency.
-
-    With e the energy of the kept edges over that of noise in eight directions, e_(2) its second
-    smallest entry, and S/N the spectrum over noise in 3 bands by 8 sectors::
-
-        score = ( log10 e_(2) + mean log10 max(S/N, 1) ) / full_marks
-    """
-
-    full_marks: float = 8.0  # what counts as 1
-
-    def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
-        """Return one score a window; see `lensmodel.Selector`."""
-        information = np.maximum(looked.information, 0.0).mean(axis=(1, 2)) / np.log(10.0)
-        return np.clip((edge_score(windows) + information) / self.full_marks, 0.0, 1.0)
-
-
-def edge_score(windows: Windows) -> NDArray[np.float64]:
-    """Decimal logarithm of the second weakest direction's edge energy over noise, at least 0."""
-    return np.log10(np.maximum(np.sort(windows.directions, axis=1)[:, 1], 1.0))

@@ -11,8 +11,10 @@ import itertools
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Final, Literal, Protocol, TypeAlias
 
 import numpy as np
@@ -21,21 +23,17 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, Frame, NoiseModel, Plane, StepHook, ignore_step, zone_of
-from lensmodel.patches.good_regions import GoodRegionsSelector
-from lensmodel.patches.rmap import RMapSelector, edge_score
 from lensmodel.patches.windows import BLOCKS_A_SIDE, Details, Windows, details_of, windows_of
 from lensmodel.photo.values import LinearPhoto
 
 logger = logging.getLogger(__name__)
 
-Reason: TypeAlias = Literal["border", "clipped", "dark", "flat", "one-directional", "periodic", "duplicate"]
+Reason: TypeAlias = Literal["border", "clipped", "dark", "flat", "one-directional", "duplicate"]
 """Why a window was not taken; `duplicate` means that a better one lies too near or the quota is full."""
 
 SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
 MAX_REJECTIONS: Final = 2000  # a photo has ten thousand windows; a report needs no more than this
 CLIPPED_LIMIT: Final = 0.005  # share of a window's pixels (chosen): a few specular points do little harm
-# Connected clipped pixels (chosen): a larger area has an edge whose profile is cut off
-BLOB_LIMIT: Final = 20
 DARK_LIMIT: Final = 0.5  # share of a window's pixels: the other half still has edges (chosen)
 FLAT_CONTRAST: Final = 4.0  # variance of signal over noise: below, noise decides the estimate (chosen)
 FLAT_EIGENVALUE: Final = 10.0  # smaller eigenvalue of the structure tensor over that of noise (chosen)
@@ -44,15 +42,6 @@ SECTOR_INFORMATION: Final = float(np.log(2.0))  # power twice that of noise, sig
 JPEG_WEIGHT: Final = 0.3  # JPEG files were sharpened and gamma-coded: their patches count for less
 EVIDENCE_FLOOR: Final = 0.25  # bits a frequency: signal as strong as noise over a quarter of them
 SHORTLIST_A_SECTOR: Final = 8  # windows that the costlier scores look at: several times those taken (chosen)
-
-_ADVICE: Final[dict[str, str]] = {
-    "flat": "take a scene with more fine detail, at a lower ISO",
-    "dark": "expose longer",
-    "clipped": "expose shorter",
-    "one-directional": "take a scene with edges in all directions",
-    "periodic": "avoid fences, grids and facades that repeat",
-    "border": "crop the empty border away",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +85,83 @@ class Selector(Protocol):
         """
 
 
+# --- the selectors -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class RMapSelector:
+    """Edges in every direction where the r-map is high, and signal at every frequency.
+
+    With e the energy of the kept edges over that of noise in eight directions, e_(2) its second
+    smallest entry, and S/N the spectrum over noise in 3 bands by 8 sectors::
+
+        score = ( log10 e_(2) + mean log10 max(S/N, 1) ) / 8
+    """
+
+    def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
+        """Return one score a window; see `lensmodel.Selector`."""
+        information = np.maximum(looked.information, 0.0).mean(axis=(1, 2)) / np.log(10.0)
+        return np.clip((edge_score(windows) + information) / 8.0, 0.0, 1.0)
+
+
+def edge_score(windows: Windows) -> NDArray[np.float64]:
+    """Decimal logarithm of the second weakest direction's edge energy over noise, at least 0."""
+    return np.log10(np.maximum(np.sort(windows.directions, axis=1)[:, 1], 1.0))
+
+
+MODEL: Final = Path(__file__).parent / "data" / "good_regions.npz"
+
+FEATURES: Final = 27  # columns that `features_of` makes
+
+
+def features_of(windows: Windows, looked: Details) -> NDArray[np.float64]:
+    """What a window looks like, in numbers, `(n, FEATURES)`, always finite.
+
+    Directions are sorted by energy, so that a turned window has the same features. Energies and
+    powers are decimal logarithms over noise.
+    """
+
+    def log(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.log10(np.maximum(values, 1e-3))
+
+    bands = looked.information / np.log(10.0)
+    by_band = np.stack([bands.mean(axis=2), bands.min(axis=2), bands.max(axis=2), bands.std(axis=2)], axis=2)
+    columns = [
+        log(np.sort(windows.directions, axis=1)).T,
+        log(windows.eigenvalues).T,
+        log(windows.contrast),
+        windows.level,
+        log(windows.level / windows.sigma),
+        windows.r_mean,
+        windows.r_kept,
+        by_band.reshape(len(windows), -1).T,
+    ]
+    return np.vstack(columns).T
+
+
+@cache
+def learned() -> tuple[NDArray[np.float64], float]:
+    """Weights of the features, `(FEATURES,)`, and the offset."""
+    with np.load(MODEL, allow_pickle=False) as stored:
+        return stored["weights"], float(stored["offset"])
+
+
+@dataclass(frozen=True, slots=True)
+class GoodRegionsSelector:
+    """Predicts from the window's features how similar an estimated kernel will be to the truth.
+
+    With S the normalised cross-correlation of an estimated and the true kernel at the best shift, ln(1 - S)
+    is a linear function of the features; the score is S. In the spirit of Z. Hu and M.-H. Yang, "Good regions
+    to deblur", ECCV 2012, with differences: windows instead of pixels under a conditional random field, lens
+    blur instead of camera shake, the statistics that the r-map selector also uses.
+    """
+
+    def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
+        """Return one score a window; see `Selector`."""
+        weights, offset = learned()
+        return np.clip(1.0 - np.exp(features_of(windows, looked) @ weights + offset), 0.0, 1.0)
+
+
 selectors: Registry[Selector] = Registry(
     "patch selector", {"r-map": RMapSelector, "good-regions": GoodRegionsSelector}
 )
@@ -135,11 +201,13 @@ def select(
     reasons[usable] = "duplicate"
     if short.size:
         looked = details_of(plane, windows.take(short), clip, coarse_noise)
-        reasons[short] = _second_reasons(looked)
+        flat = looked.evidence < EVIDENCE_FLOOR
+        one_directional = looked.information[:, 0].min(axis=1) < SECTOR_INFORMATION
+        reasons[short] = np.select([flat, one_directional], ["flat", "one-directional"], default="")
         looked = Details(*(part[reasons[short] == ""] for part in looked))
         short = short[reasons[short] == ""]
     if not short.size:
-        raise NoUsablePatchesError(_nothing_usable(Counter(reasons.tolist())))
+        raise _nothing_usable(reasons.tolist())
     score = chooser.score(windows.take(short), looked)
     order = np.argsort(-score, kind="stable")
     short, score = short[order], score[order] * (JPEG_WEIGHT if jpeg else 1.0)
@@ -151,9 +219,13 @@ def select(
             corner = int(windows.rows[i]), int(windows.cols[i])
             patches.append(Patch(*corner, windows.size, position, float(told), number))
             reasons[i] = ""
-    counts = Counter(reason for reason in reasons.tolist() if reason)
-    logger.info("chose %d of %d windows; rejected: %s", len(patches), len(windows), dict(counts))
-    return Selection(tuple(patches), _rejections(windows, reasons))
+    left = np.flatnonzero(reasons != "")
+    logger.info("chose %d of %d windows; rejected: %s", len(patches), len(windows), Counter(reasons[left]))
+    rejected = [
+        Rejection(int(windows.rows[i]), int(windows.cols[i]), windows.size, reasons[i])
+        for i in left[:: left.size // MAX_REJECTIONS + 1]
+    ]
+    return Selection(tuple(patches), tuple(rejected))
 
 
 def _require_room(frame: Frame, size: int) -> None:
@@ -167,47 +239,23 @@ def _require_room(frame: Frame, size: int) -> None:
 def first_reasons(windows: Windows) -> NDArray[np.str_]:
     """Reason of each window from block sums alone, the first that holds; empty where none does."""
     small, large = windows.eigenvalues.T
-    return _first(
+    tests: list[tuple[Reason, NDArray[np.bool_]]] = [
         ("border", windows.missing > 0.0),
         ("clipped", windows.clipped > CLIPPED_LIMIT),
         ("dark", windows.dark > DARK_LIMIT),
         ("flat", (windows.contrast < FLAT_CONTRAST) | (large < FLAT_EIGENVALUE)),
         ("one-directional", small < ONE_DIRECTION_RATIO * large),
         ("flat", small < FLAT_EIGENVALUE),
-    )
-
-
-def _second_reasons(looked: Details) -> NDArray[np.str_]:
-    """Reason of each window from its own pixels; empty where none holds."""
-    return _first(
-        ("clipped", looked.blob > BLOB_LIMIT),
-        ("flat", looked.evidence < EVIDENCE_FLOOR),
-        ("periodic", looked.periodic),
-        ("one-directional", looked.information[:, 0].min(axis=1) < SECTOR_INFORMATION),
-    )
-
-
-def _first(*tests: tuple[Reason, NDArray[np.bool_]]) -> NDArray[np.str_]:
+    ]
     return np.select([test for _, test in tests], [reason for reason, _ in tests], default="").astype("U16")
 
 
-def _rejections(windows: Windows, reasons: NDArray[np.str_]) -> tuple[Rejection, ...]:
-    """Return the rejected windows, thinned evenly in reading order when there are too many."""
-    at = np.flatnonzero(reasons != "")
-    if at.size > MAX_REJECTIONS:
-        at = at[np.linspace(0, at.size - 1, MAX_REJECTIONS).astype(np.intp)]
-    return tuple(
-        Rejection(int(windows.rows[i]), int(windows.cols[i]), windows.size, str(reasons[i]))  # type: ignore[arg-type]  # only reasons are stored
-        for i in at
-    )
-
-
-def _nothing_usable(counts: Counter[str]) -> str:
-    reason, times = counts.most_common(1)[0]
+def _nothing_usable(reasons: Iterable[str]) -> NoUsablePatchesError:
+    counts = Counter(reasons)
     listed = ", ".join(f"{name} {number}" for name, number in counts.most_common())
-    return (
-        f"none of {counts.total()} windows is usable ({listed}); {times} are rejected as {reason}: "
-        f"{_ADVICE.get(reason, 'use another photo')}"
+    return NoUsablePatchesError(
+        f"none of {counts.total()} windows is usable ({listed}); take a well exposed scene with fine detail "
+        "in all directions, at a low ISO"
     )
 
 
@@ -331,11 +379,7 @@ def spread_evenly(developed: LinearPhoto, *, count: int, size: int) -> Selection
         else:
             rejected.append(Rejection(top, left, size, reason))
     if not patches:
-        reasons = sorted({rejection.reason for rejection in rejected})
-        raise NoUsablePatchesError(
-            f"none of {len(rejected)} windows is usable ({', '.join(reasons)}); "
-            "take a scene with fine detail all over, at a lower ISO"
-        )
+        raise _nothing_usable(rejection.reason for rejection in rejected)
     return Selection(tuple(patches), tuple(rejected))
 
 
@@ -394,15 +438,10 @@ def require_enough(patches: Sequence[Patch], *, least: int = LEAST_PATCHES) -> N
         if all(max(abs(patch.row - k.row), abs(patch.col - k.col)) >= patch.size / 2 for k in single):
             single.append(patch)
     parts = len({part_of(patch.position) for patch in single})
-    if len(single) < least:
-        places = "one place" if len(single) == 1 else f"{len(single)} places"
+    needed = min(LEAST_PARTS, least)
+    if len(single) < least or parts < needed:
         raise NoUsablePatchesError(
-            f"fine detail in focus was found in only {places}, and a photo counts from {least} on; take a "
-            "scene full of detail, at a low ISO, and give the photo in its full size"
-        )
-    if parts < min(LEAST_PARTS, least):
-        raise NoUsablePatchesError(
-            f"fine detail in focus was found in only {parts} of {PARTS} parts of the picture (the centre, "
-            f"four quarters and their outer ends), and a photo counts from {LEAST_PARTS} on; take "
-            "a scene with detail all over"
+            f"fine detail in focus was found in {len(single)} places, in {parts} of {PARTS} parts of the "
+            f"picture (the centre, four quarters, their outer ends); a photo counts from {least} places in "
+            f"{needed} parts on; take a scene with detail all over, at a low ISO, in its full size"
         )

@@ -1,7 +1,7 @@
 """The windows of a photo: what is known of each candidate, as arrays.
 
-One pass over a plane sums over small blocks, from which any window is put together (`windows_of`). A few are
-then looked at by themselves (`details_of`): their spectrum, repetition and blobs.
+One pass over a plane sums over small blocks, from which any window is put together (`windows_of`). The
+spectra of a few are then looked at by themselves (`details_of`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import fft
 
 from lensmodel.core.types import Frame, NoiseModel, Plane, StepHook
 from lensmodel.patches.rmap import (
@@ -208,17 +208,11 @@ EVIDENCE_EDGES: Final = (0.1, 0.2, 0.3, 0.4)
 NON_UNIFORMITY: Final = 0.005  # relative deviation of the gain of pixels: 0.3 to 1 percent by EMVA 1288
 DYNAMIC_RANGE: Final = 2.0**14.8  # of the best sensors: less noise was eaten by rounding or denoising
 
-_MAIN_LOBE_PX: Final = 8  # nearer peaks of the autocorrelation are the blur itself (chosen)
-_ON_THE_WAY: Final = 24  # points from a peak to the middle: a valley is wider than a twentieth of it (chosen)
-_ALIKE: Final = 0.8  # peak of what repeats: other scenes seldom are as alike as that (chosen)
-
 
 class Details(NamedTuple):
     """Second look at some windows; every array has one entry a window along axis 0."""
 
     information: NDArray[np.float64]  # (n, BANDS, SECTORS), natural logarithm of mean power over noise
-    periodic: NDArray[np.bool_]  # (n,), whether it `repeats`
-    blob: NDArray[np.int64]  # (n,), pixels of the largest connected clipped area
     # (n,), bits a frequency, log2(1 + signal / noise), between 0.1 and 0.4 cycles/pixel; 0 for noise:
     # C. E. Shannon, "Communication in the presence of noise", Proc. IRE 37, 1949
     evidence: NDArray[np.float64]
@@ -237,17 +231,10 @@ def details_of(plane: Plane, windows: Windows, clip: float, coarse: NoiseModel |
         detrended = (values.ravel() - slopes @ (values.ravel() @ slopes)).reshape(values.shape)
         power = periodogram(detrended)
         information = np.log(np.maximum(_means(power, bands)[0] / max(fine[i], 1e-12), 1e-3))
-        areas = ndimage.label(values >= CLIP_SHARE * clip)[0]
         mean, count = _means(power, evident)
         least = noise[i] + (NON_UNIFORMITY * values.mean()) ** 2 + (clip / DYNAMIC_RANGE) ** 2
-        rows.append(
-            (
-                information.reshape(BANDS, SECTORS),
-                repeats(power, fine[i], values.shape),
-                np.bincount(areas.ravel())[1:].max(initial=0),
-                np.log2(1.0 + np.maximum(mean / max(least, 1e-30) - 1.0, 0.0)) @ count / count.sum(),
-            )
-        )
+        bits = np.log2(1.0 + np.maximum(mean / max(least, 1e-30) - 1.0, 0.0)) @ count / count.sum()
+        rows.append((information.reshape(BANDS, SECTORS), bits))
     return Details(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
@@ -274,26 +261,3 @@ def periodogram(values: NDArray[np.floating]) -> NDArray[np.float64]:
     """Power at the frequencies of `rfft2` under a Hann window, by which white noise has its variance."""
     hann = np.outer(*(np.hanning(n + 2)[1:-1] for n in values.shape))
     return np.square(np.abs(fft.rfft2(values * hann))) / np.square(hann).sum()
-
-
-def repeats(power: NDArray[np.float64], noise: float, shape: tuple[int, ...]) -> bool:
-    """Whether what has this periodogram repeats, as a fence does.
-
-    That is so where the autocorrelation of its gradients has a peak near one that a valley of half its height
-    parts from the middle.
-    """
-    square = np.square(2.0 * np.pi * np.hypot(fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])))
-    gradients = np.maximum(power - noise, 0.0) * square * np.exp(-2.0 * square)  # smoothed ones
-    window = periodogram(np.ones(shape))  # its autocorrelation takes weight from long lags
-    reach = min(shape) // 3
-    near = np.ix_(*(np.arange(n // 2 - reach, n // 2 + reach + 1) for n in shape))
-    correlation, taper = (fft.fftshift(fft.irfft2(part, s=shape))[near] for part in (gradients, window))
-    correlation /= taper * max(correlation[reach, reach] / taper[reach, reach], 1e-300)
-    lags = np.hypot(*np.ogrid[-reach : reach + 1, -reach : reach + 1])
-    highest = (correlation == ndimage.maximum_filter(correlation, 3)) & (correlation > _ALIKE)
-    t = np.linspace(0.0, 1.0, _ON_THE_WAY)[:, None]
-    for peak in np.argwhere(highest & (lags >= _MAIN_LOBE_PX)):
-        way = np.rint(reach + (peak - reach) * t).astype(int)
-        if correlation[way[:, 0], way[:, 1]].min() < 0.5 * correlation[tuple(peak)]:
-            return True
-    return False

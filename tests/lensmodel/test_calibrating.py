@@ -124,7 +124,7 @@ class Round:
     def estimate(
         self, patches: Sequence[Plane], noise: object, *, size: int, green: lensmodel.PsfEstimate | None
     ) -> lensmodel.PsfEstimate:
-        return green or lensmodel.PsfEstimate(gaussian(size, np.eye(2)), 0.5, 0.3)
+        return green or lensmodel.PsfEstimate(gaussian(size, np.eye(2)), 0.3)
 
 
 def test_a_raw_file_is_opened_and_hashed_once_and_all_share_one_pool(

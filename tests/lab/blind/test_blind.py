@@ -52,7 +52,7 @@ class Fake:
         self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
         self.asked.append(len(patches))
-        return PsfEstimate(kernels.gaussian(size, np.eye(2) * self.sigma**2), 0.5, 0.3)
+        return PsfEstimate(kernels.gaussian(size, np.eye(2) * self.sigma**2), 0.3)
 
 
 def run(cache: Path | None = None, *, cases: int = 3, **methods: Fake) -> BlindReport:
@@ -118,7 +118,7 @@ class Oracle(Fake):
 
     def estimate(self, patches: Sequence[Plane], noise: Sequence[NoiseModel], **_: object) -> PsfEstimate:
         off_centre = np.roll(np.pad(np.array(self.kernel), 2), (1, 2), axis=(0, 1))
-        return PsfEstimate(psf.as_kernel(off_centre), 0.5, 0.3)
+        return PsfEstimate(psf.as_kernel(off_centre), 0.3)
 
 
 def test_error_ratio_of_the_true_kernel_is_one(monkeypatch: pytest.MonkeyPatch) -> None:

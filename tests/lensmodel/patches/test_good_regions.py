@@ -6,8 +6,7 @@ from scipy import ndimage
 
 from lensmodel.core.types import Frame, NoiseModel, Plane, ignore_step
 from lensmodel.patches import Selector
-from lensmodel.patches.good_regions import FEATURES, GoodRegionsSelector, features_of
-from lensmodel.patches.rmap import RMapSelector
+from lensmodel.patches.select import FEATURES, GoodRegionsSelector, RMapSelector, features_of
 from lensmodel.patches.windows import Details, Windows, details_of, windows_of
 
 SIGMA = 0.004

@@ -23,9 +23,9 @@ from lensmodel.core.errors import InvalidInputError, OutsideSupportError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import Channel, FieldPosition, LensSettings, StepHook, ignore_step
 from lensmodel.lens import Lens
-from lensmodel.model import LensModel, LensProfile, ModelField
+from lensmodel.model import LensModel, ModelField
 from lensmodel.model.camera_bodies import ALIKE, circle_mm
-from lensmodel.model.profile import Identity, difference
+from lensmodel.model.identity import Identity, difference
 from lensmodel.model.query import PAPER
 from lensmodel.patches import Selector
 from lensmodel.photo import LinearPhoto, PhotoMetadata
@@ -218,21 +218,21 @@ class Calibration:
         lens, identity = self.known, identities[0]
         self._require_same(lens, identity)
         if lens is None:
-            known = LensProfile(LensModel.fit(samples, self._config.model))
+            known = Lens(LensModel.fit(samples, self._config.model))
         else:
-            known = dataclasses.replace(lens.profile, model=lens.model.added(samples))
-        names = known.lens
+            known = dataclasses.replace(lens, model=lens.model.added(samples))
+        names = known.names
         if lens is None or not self._any_lens:  # a photo that may be of another lens does not name this one
             names = {**identity.names, **names}
         cameras = tuple(dict.fromkeys([*known.cameras, *identity.cameras]))
-        self._store.keep(Lens(LensProfile(known.model, names, {**known.photos, key: path.name}, cameras)))
+        self._store.keep(Lens(known.model, names, {**known.photos, key: path.name}, cameras))
         return len(samples)
 
     def _knows(self, key: str) -> bool:
         """Whether the lens was learned from a photo already."""
         lens = self.known
         return lens is not None and (
-            key in lens.profile.photos or any(sample.photo == key for sample in lens.samples)
+            key in lens.photos or any(sample.photo == key for sample in lens.samples)
         )
 
     def _sampled(
@@ -268,7 +268,7 @@ class Calibration:
         """Refuse a photo of another lens."""
         if lens is None or self._any_lens:
             return
-        why = difference(Identity.of_profile(lens.profile), identity)
+        why = difference(lens.identity, identity)
         if why is not None:
             raise InvalidInputError(
                 f"it seems to be of another lens: {why}; give it a profile of its own, or allow it "

@@ -57,7 +57,7 @@ names = {}
 exec(compile(lines.group(1), "docs/library.md", "exec"), names)  # its calibrate starts processes by itself
 assert names["kernel"].shape == (55, 55) and abs(names["kernel"].sum() - 1.0) < 1e-9
 assert names["photo"].planes.shape == (3, camera.height, camera.width)
-assert sorted(names["lens"].profile.photos.values()) == ["a.dng", "b.dng"]
+assert sorted(names["lens"].photos.values()) == ["a.dng", "b.dng"]
 assert lensmodel.Lens.load("my-24mm.lensprofile").samples and Path("c.tif").exists()
 PYTHON
 )

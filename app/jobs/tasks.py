@@ -38,8 +38,8 @@ from lensmodel.core.errors import ImageTooLargeError, LensModelError
 from lensmodel.core.files import from_json, to_json
 from lensmodel.core.names import camera_name
 from lensmodel.core.types import FieldPosition, LensSettings, Planes
+from lensmodel.lens import read_profile
 from lensmodel.model import LensModel
-from lensmodel.model.profile import read_profile
 from lensmodel.neural import FieldNetwork
 from lensmodel.patches import Patch
 from lensmodel.patches.select import Rejection
@@ -272,7 +272,7 @@ def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     write_samples(folder, samples)
     cameras = sorted({camera_name(camera.maker, camera.model) for camera in read.cameras} - {""})
     # of the cameras the service asks only whether there is one
-    named = {"photos": read.photos, "lens": read.lens, "cameras": cameras[:2]}
+    named = {"photos": read.photos, "lens": read.names, "cameras": cameras[:2]}
     return {"mode": read.model.mode, "samples": len(samples), **named}
 
 

@@ -47,7 +47,7 @@ from lensmodel.core.names import full_name, name_key, serial_key
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition
 from lensmodel.correction import Bounds
-from lensmodel.model.profile import Identity, difference
+from lensmodel.model.identity import Identity, difference
 from lensmodel.patches import Patch
 
 log = logging.getLogger(__name__)

@@ -14,8 +14,7 @@ from app.http.dependencies import Call
 from app.http.errors import MEDIA_TYPE
 from app.schemas import OptionalName, Problem
 from app.store.tables import LensRow, PhotoRow
-from lensmodel.model import Camera
-from lensmodel.model.profile import Identity, difference
+from lensmodel.model.identity import Camera, Identity, difference
 
 Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
 _ID: Final = "^[A-Za-z0-9]{1,40}$"

@@ -99,7 +99,7 @@ def calibrate(
                 bar.show(len(results))
     lens = calibration.known
     coverage = {} if lens is None else lens.model.coverage()
-    photo_count = len(lens.profile.photos) if lens else 0
+    photo_count = len(lens.photos) if lens else 0
     failed = [result for result in results if result["state"] == "failed"]
     shown.document(
         {

@@ -26,7 +26,7 @@ from lensmodel.core.names import camera_name, name_key, serial_key
 from lensmodel.core.types import LensSettings, StepHook
 from lensmodel.correction import Bounds, deconvolvers
 from lensmodel.lens import Lens
-from lensmodel.model.profile import SAME_FOCAL, Identity, difference
+from lensmodel.model.identity import SAME_FOCAL, Identity, difference
 from lensmodel.photo import OutputFormat, PhotoMetadata, inspect
 from lensmodel.photo.values import CORRECTED
 
@@ -132,7 +132,7 @@ def correct(
         profiles = profiles or next(iter(targets.values())).parent / PROFILES
         document = correct_groups(correction, profiles, learn_from)
     else:
-        known = Lens(files.profile_at(profile))
+        known = files.profile_at(profile)
         document = {"profile": str(profile), "results": correction.photos(list(targets), known)}
     shown.document(document)
     if any(result["state"] == "failed" for result in document["results"]):
@@ -238,7 +238,7 @@ class Correction:
     def _require_lens(self, path: Path, said: PhotoMetadata, lens: Lens) -> None:
         """Refuse a photo of another lens, unless it is asked for; tell what the photo does not say."""
         identity, note = Identity.of(said), self.display.note
-        if why := difference(Identity.of_profile(lens.profile), identity):
+        if why := difference(lens.identity, identity):
             why = f"it seems to be of another lens: {why}"
             if not (self.any_lens or self.force):
                 raise InvalidInputError(f"{why}; use the profile of its own lens, or add --any-lens")
@@ -394,7 +394,7 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
     # those of a zoom have one profile: all are learned before any is corrected
     learned = [_learn(group, profile, most, correction) for group, profile in lens_groups]
     for (group, profile), number in zip(lens_groups, learned, strict=True):
-        lens = Lens(files.profile_at(profile)) if profile.exists() else None
+        lens = files.profile_at(profile) if profile.exists() else None
         done = correction.photos([shot.path for shot in group.shots], lens)
         results += done
         states = Counter(result["state"] for result in done)

@@ -13,7 +13,6 @@ from lensmodel.api import LensStore
 from lensmodel.cli.console import UsageError, reason
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.lens import Lens
-from lensmodel.model import LensProfile, load_profile
 from lensmodel.photo.values import CORRECTED, ENDINGS, RAW_ENDINGS
 
 # What phones add to the names of the files of one shot
@@ -68,7 +67,7 @@ def refuse_photo(target: Path, photos: Sequence[Path]) -> None:
         )
 
 
-def profile_at(path: Path) -> LensProfile:
+def profile_at(path: Path) -> Lens:
     """Open a profile."""
     if path.is_dir():
         raise UsageError(f"{path} is a folder; give the file of a lens profile")
@@ -76,7 +75,7 @@ def profile_at(path: Path) -> LensProfile:
         raise UsageError(
             f"no lens profile at {path}; make it with `lensmodel calibrate PHOTO... --profile {path}`"
         )
-    return load_profile(path)
+    return Lens.load(path)
 
 
 class ProfileFile(LensStore):
@@ -98,7 +97,7 @@ class ProfileFile(LensStore):
         stamp = _stamp(self._target)
         if stamp in {None, self._stamp_read}:
             return self._lens
-        lens = Lens(profile_at(self._target))
+        lens = profile_at(self._target)
         learned = lens.model.mode
         if self._wanted not in {None, learned}:  # its kernels are the other model's: both would be mixed
             raise InvalidInputError(

@@ -67,10 +67,10 @@ def measured(profile: Path, aperture: float | None) -> LensReport:
         asked = None if aperture is None else [LensSettings(aperture=aperture).aperture or aperture]
         return lens_report(
             known.model,
-            name_of(known.lens) or profile.stem,
+            name_of(known.names) or profile.stem,
             apertures=asked,
             details=provenance(
-                known.lens.get("serial"),
+                known.names.get("serial"),
                 [camera_name(camera.maker, camera.model) for camera in known.cameras],
                 list(known.photos.values()),
             ),

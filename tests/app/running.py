@@ -28,7 +28,8 @@ from app.runtime.settings import Settings
 from lab.kernels import gaussian
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile
+from lensmodel.lens import Lens
+from lensmodel.model import LensModel
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.photo.writing import write_bayer_dng
 from lensmodel.simulate import demo_scene
@@ -194,7 +195,7 @@ def write_photo(
     return write_light(path, light, seed, serial=serial, aperture=aperture)
 
 
-def lens_of_one_blur() -> LensProfile:
+def lens_of_one_blur() -> Lens:
     """The profile of the lens of `write_photo`, which blurs alike everywhere, learned from another photo."""
     samples = [
         PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
@@ -202,7 +203,7 @@ def lens_of_one_blur() -> LensProfile:
         for phi in (-2.0, 0.5, 2.5)
     ]
     names = {"maker": "Test Optics", "model": "Test 35mm f/1.8", "serial": "L-42"}
-    return LensProfile(LensModel.fit(samples), names, {"0123456789abcdef": "x.dng"})
+    return Lens(LensModel.fit(samples), names, {"0123456789abcdef": "x.dng"})
 
 
 def write_light(

@@ -24,7 +24,7 @@ from lensmodel.core.errors import CancelledError, InvalidInputError, MetadataMis
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings, Plane
 from lensmodel.lens import Lens
-from lensmodel.model import LensModel, LensProfile
+from lensmodel.model import LensModel
 from lensmodel.photo.writing import write_bayer_dng
 
 
@@ -73,7 +73,7 @@ def test_a_lens_is_kept_after_each_photo_and_what_another_run_added_meanwhile_st
     kept = store.lens()
     assert kept is not None
     model = LensModel.fit([*kept.samples, *samples_of("x")])
-    store.keep(Lens(replace(kept.profile, model=model, photos={**kept.profile.photos, "x": "x.dng"})))
+    store.keep(replace(kept, model=model, photos={**kept.photos, "x": "x.dng"}))
 
     assert [(event.stage, event.total) for event in (first, *events)] == [
         ("counted", 9),
@@ -82,13 +82,13 @@ def test_a_lens_is_kept_after_each_photo_and_what_another_run_added_meanwhile_st
     ]
     lens = store.lens()
     assert lens is not None
-    assert sorted(lens.profile.photos.values()) == ["a.dng", "b.dng", "x.dng"]
+    assert sorted(lens.photos.values()) == ["a.dng", "b.dng", "x.dng"]
     assert store.kept == [9, 18, 27]
 
 
 def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
     key = sampling.photo_id(photos[0])
-    store = Noting(Lens(LensProfile(LensModel.fit(samples_of(key)), {}, {key: "a.dng"})))
+    store = Noting(Lens(LensModel.fit(samples_of(key)), {}, {key: "a.dng"}))
     calibration = Calibration(store, sampling.PRESETS["default"])
 
     (event,) = calibration.learn(photos[:1])
@@ -157,7 +157,7 @@ def test_a_raw_file_is_opened_and_hashed_once_and_all_share_one_pool(
 
     lens = lensmodel.calibrate(sorted(tmp_path.glob("*.dng")), estimator=Round(), kernel_size=15, patches=24)
 
-    assert len(lens.profile.photos) == 2
+    assert len(lens.photos) == 2
     assert counts == {"opened": 2, "hashed": 2, "pools": 1}
 
 

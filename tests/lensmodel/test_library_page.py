@@ -51,7 +51,7 @@ def test_the_five_lines_run(photos: Path, monkeypatch: pytest.MonkeyPatch, estim
     exec(FIVE_LINES, names)
 
     lens, kernel, corrected = names["lens"], names["kernel"], names["photo"].planes
-    assert sorted(lens.profile.photos.values()) == ["a.dng", "b.dng"]
+    assert sorted(lens.photos.values()) == ["a.dng", "b.dng"]
     assert (kernel.shape, kernel.sum()) == ((55, 55), pytest.approx(1.0))
     # of a Gaussian: exp(-2 (pi s f)^2) = 1/2
     half = math.sqrt(math.log(2.0) / 2.0) / (math.pi * WIDTH_PX)
@@ -79,7 +79,7 @@ def test_every_block_of_the_page_runs(photos: Path, monkeypatch: pytest.MonkeyPa
     assert names["kernel"].shape == (55, 55)
     assert names["photo"].planes.shape == (3, ROWS, COLS)
     assert {"c.tif", "my-24mm.lensprofile"} <= {path.name for path in photos.iterdir()}
-    assert sorted(names["lens"].profile.photos.values()) == ["a.dng", "b.dng"]
+    assert sorted(names["lens"].photos.values()) == ["a.dng", "b.dng"]
 
 
 def _registries() -> dict[str, Any]:

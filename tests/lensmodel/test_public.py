@@ -20,7 +20,7 @@ from lensmodel.core.psf import PsfSample, centroid
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings, field_grid
 from lensmodel.lens import Lens
-from lensmodel.model import LensModel, LensProfile
+from lensmodel.model import LensModel
 
 HEAVY = {"numpy", "scipy", "rawpy", "fastapi", "sqlalchemy", "pydantic", "app", "lab"}
 SERVICE = {"fastapi", "sqlalchemy", "pydantic", "dbos", "structlog", "app", "lab"}
@@ -85,7 +85,7 @@ def test_every_question_to_a_zoom_can_name_its_focal_length_and_focus() -> None:
         for r in (0.1, 0.5, 0.9)
         for phi in (-2.0, 0.5, 2.5)
     ]
-    lens = Lens(LensProfile(LensModel.fit(samples)))
+    lens = Lens(LensModel.fit(samples))
     wide, long = ({"aperture": 2.8, "focal_mm": focal, "focus_m": 0.5} for focal in (24.0, 70.0))
 
     assert lens.kernels(0.5, 0.5, size=15, **wide) == pytest.approx(

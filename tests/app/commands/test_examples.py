@@ -41,7 +41,6 @@ from lab.lens_test import MARGIN, squares_chart
 from lensmodel.cli.main import OnDemand, app
 from lensmodel.core.types import Frame
 from lensmodel.measured.target import TargetPage
-from lensmodel.model import save_profile
 
 HERE = Path(__file__).parents[3]
 PATIENCE_S = 240.0
@@ -141,8 +140,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder / "stars.npz", psf=np.stack([gaussian(15, np.eye(2) * (1.0 + x)) for x in r]), r=r, phi=phi
     )
     known = lens_of_one_blur()
-    save_profile(folder / "my-24mm.lensprofile", known)
-    save_profile(folder / "a-friends-24mm.lensprofile", replace(known, lens={**known.lens, "serial": "L-43"}))
+    known.save(folder / "my-24mm.lensprofile")
+    replace(known, names={**known.names, "serial": "L-43"}).save(folder / "a-friends-24mm.lensprofile")
     settings = Settings(data_dir=folder / "lensmodel-data")
     with contextlib.closing(Store(settings)) as store:
         upgrade(store.database)

@@ -35,7 +35,8 @@ from lensmodel import photo
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import EncodedPatch, PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.lens import Lens
+from lensmodel.model import LensModel
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.photo.writing import write_bayer_dng
 
@@ -68,7 +69,7 @@ READERS: dict[str, tuple[str, Reader]] = {
     "inspect jpeg": ("a.jpg", photo.inspect),
     "inspect png": ("a.png", photo.inspect),
     "sniff": ("a.dng", lambda path: photo.sniff(path.read_bytes()[: photo.HEAD_BYTES])),
-    "profile": ("a.lensprofile", load_profile),
+    "profile": ("a.lensprofile", Lens.load),
     "encoded": ("encoded", lambda path: EncodedPatch.from_bytes(path.read_bytes())),
     "multipart": ("multipart", _multipart),
 }
@@ -90,8 +91,8 @@ def write_seeds(folder: Path) -> None:
         PsfSample(gaussian(15, np.eye(2)), FieldPosition(r, 0.3), LensSettings(2.8, 35.0), photo="x")
         for r in (0.1, 0.5, 0.9)
     ]
-    profile = LensProfile(LensModel.fit(samples), {"model": "x"}, {"0" * 16: "x.dng"})
-    save_profile(folder / "a.lensprofile", profile)
+    profile = Lens(LensModel.fit(samples), {"model": "x"}, {"0" * 16: "x.dng"})
+    profile.save(folder / "a.lensprofile")
     (folder / "encoded").write_bytes(b"\x00" + rng.bytes(1024))
     (folder / "multipart").write_bytes(
         b'--lens\r\nContent-Disposition: form-data; name="aperture"\r\n\r\n2.8\r\n'

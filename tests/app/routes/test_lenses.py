@@ -24,8 +24,9 @@ from app.store import LensName, Store
 from app.store.tables import SampleRow
 from lensmodel.core.psf import centroid, rms_width
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile
-from lensmodel.model.profile import Camera, read_profile, write_profile
+from lensmodel.lens import Lens, read_profile, write_profile
+from lensmodel.model import LensModel
+from lensmodel.model.identity import Camera
 from lensmodel.model.query import PAPER
 
 PLACE = "r=0.9&phi=0.59&aperture=1.4"
@@ -295,7 +296,7 @@ def profile(client: TestClient, learned: str) -> bytes:
 
 def changed(profile: bytes, **changes: Any) -> bytes:
     """Return a profile in which something else is written."""
-    known: LensProfile = read_profile(io.BytesIO(profile), "The answer")
+    known: Lens = read_profile(io.BytesIO(profile), "The answer")
     out = io.BytesIO()
     write_profile(out, replace(known, **changes))
     return out.getvalue()
@@ -347,7 +348,7 @@ D750, BODY = Camera("NIKON CORPORATION", "NIKON D750", "1"), Camera("Leica", "M8
 def test_a_lens_made_of_a_profile_alone_is_called_as_that_says_else_as_its_file(
     client: TestClient, profile: bytes, lens_is: dict[str, str], cameras: tuple[Camera, ...], name: str
 ) -> None:
-    sent = changed(profile, lens=lens_is, cameras=cameras)
+    sent = changed(profile, names=lens_is, cameras=cameras)
 
     for rename, called in ((True, name), (False, "file")):
         made = client.post("/v1/lenses", json={"label": "file"})

@@ -37,7 +37,7 @@ from lensmodel.cli import files
 from lensmodel.cli.correct import targets_of
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import load_profile, save_profile
+from lensmodel.lens import Lens
 
 HERE = Path(__file__).parents[1]
 PICTURE = np.random.default_rng(0).integers(20, 220, (320, 400, 3), dtype=np.uint8)
@@ -95,7 +95,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_photo(folder / "a.dng", 1, shape=SMALL)
     write_photo(folder / "b.dng", 2, shape=SMALL)
     write_photo(folder / "other.dng", 3, serial="L-43", shape=SMALL)
-    save_profile(folder / PROFILE, lens_of_one_blur())
+    lens_of_one_blur().save(folder / PROFILE)
     return folder
 
 
@@ -130,7 +130,7 @@ def test_calibrate_learns_once_from_each_photo_and_says_so_in_json(
     assert [result["state"] for result in said["results"]] == ["counted"]
     assert [result["state"] for result in then["results"]] == ["known"]
     assert said["samples"] == then["samples"] > 0
-    assert load_profile(folder / "new/lens.lensprofile").lens["serial"] == "L-42"
+    assert Lens.load(folder / "new/lens.lensprofile").names["serial"] == "L-42"
 
 
 @pytest.mark.slow
@@ -139,7 +139,7 @@ def test_calibrate_force_begins_anew(folder: Path, here: Here) -> None:
     done = here("calibrate", "one.dng", "-p", PROFILE, "--estimator", "default", "--force")
 
     assert done.returncode == 0, done.stderr
-    assert list(load_profile(folder / PROFILE).photos.values()) == ["one.dng"]
+    assert list(Lens.load(folder / PROFILE).photos.values()) == ["one.dng"]
 
 
 def test_correct_leaves_what_is_there_alone_unless_forced(folder: Path, here: Here) -> None:
@@ -248,15 +248,15 @@ def test_two_runs_on_one_profile_drop_nothing_of_each_other(
     def estimated(path: Path, config: sampling.Config, **options: Any) -> list[PsfSample]:
         assert config.settings.aperture == 8.0  # for photos that do not say their own
         options["admit"](photo.inspect(path).metadata)
-        known = load_profile(folder / PROFILE)  # the other run saves while this one estimates
-        save_profile(folder / PROFILE, replace(known, photos={**known.photos, "fedcba9876543210": "y.dng"}))
+        known = Lens.load(folder / PROFILE)  # the other run saves while this one estimates
+        replace(known, photos={**known.photos, "fedcba9876543210": "y.dng"}).save(folder / PROFILE)
         return [PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.5, 0.0), LensSettings(2.8), photo="z")]
 
     monkeypatch.setattr("lensmodel.blind.sampling.samples_of_photo", estimated)
     done = here("calibrate", "one.dng", "-p", PROFILE, "--aperture", "8")
 
     assert done.returncode == 0, done.stderr
-    assert sorted(load_profile(folder / PROFILE).photos.values()) == ["one.dng", "x.dng", "y.dng"]
+    assert sorted(Lens.load(folder / PROFILE).photos.values()) == ["one.dng", "x.dng", "y.dng"]
 
 
 def test_a_photo_that_does_not_count_leaves_no_trace(folder: Path, here: Here) -> None:
@@ -422,7 +422,7 @@ def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
     quick = ("--estimator", "default", "--kernel-size", "21")
     result = json.loads(here(*words, *quick, "--model", "paper").stdout)
 
-    kept = load_profile(folder / new).model
+    kept = Lens.load(folder / new).model
     sides = {sample.kernel.shape for sample in kept.samples}
     assert (result["model"], kept.mode) == ("paper", "paper")
     assert max(sides) <= (21, 21)
@@ -436,7 +436,7 @@ def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
         refused = here("calibrate", "one.dng", "-p", profile, "--any-lens", *quick, "--model", asked)
         assert refused.returncode != 0
         assert f"has the model {has}, not {asked}" in refused.stderr
-        assert load_profile(folder / profile).model.mode == has
+        assert Lens.load(folder / profile).model.mode == has
 
 
 def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:
@@ -495,7 +495,7 @@ def test_stopped_calibration_keeps_finished_photos_and_goes_on(
     assert process.returncode == 128 + number
     assert said == ""
     assert "finished files are kept" in one_sentence(errors)
-    assert list(load_profile(profile).photos.values()) == ["one.jpg"]
+    assert list(Lens.load(profile).photos.values()) == ["one.jpg"]
     again = json.loads(here(*words, "--workers", "1").stdout)
     assert [result["state"] for result in again["results"]] == ["known", "counted"]
 

@@ -19,7 +19,7 @@ from lensmodel.blind import sampling
 from lensmodel.cli.main import app
 from lensmodel.core import processes
 from lensmodel.core.psf import PsfSample
-from lensmodel.model import load_profile
+from lensmodel.lens import Lens
 
 
 class Counting(ThreadPoolExecutor):
@@ -119,7 +119,7 @@ def test_a_cluster_of_two_processes_calibrates_the_same_profile(tmp_path: Path) 
     near = calibrate(*photos, *quick, "-p", tmp_path / "near.lensprofile")
 
     assert (far.exit_code, near.exit_code) == (0, 0), far.output + near.output
-    one, other = (load_profile(tmp_path / f"{name}.lensprofile").model for name in ("far", "near"))
+    one, other = (Lens.load(tmp_path / f"{name}.lensprofile").model for name in ("far", "near"))
     np.testing.assert_array_equal(stacked(list(one.samples)), stacked(list(other.samples)))
 
 

@@ -21,8 +21,8 @@ from running import SMALL, lens_of_one_blur, write_photo
 from lensmodel.blind.sampling import photo_id
 from lensmodel.cli.console import Bar
 from lensmodel.cli.correct import Shot, groups
-from lensmodel.model import load_profile, save_profile
-from lensmodel.model.profile import Camera
+from lensmodel.lens import Lens
+from lensmodel.model.identity import Camera
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
@@ -46,7 +46,7 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "lenses").mkdir()
     (group,) = groups([Shot.of(photos / "a.dng")])
     profile = replace(lens_of_one_blur(), photos=known, cameras=(Camera("Test", "T-1", None),))
-    save_profile(here / "lenses" / f"{group.name}.lensprofile", profile)
+    profile.save(here / "lenses" / f"{group.name}.lensprofile")
     return here
 
 
@@ -147,7 +147,7 @@ def test_a_folder_of_an_unknown_lens_is_learned_and_corrected(tmp_path: Path) ->
     (group,) = json.loads(done.stdout)["groups"]
     assert group["learned_from"] == 1
     assert group["corrected"] + group["left"] == 2
-    assert load_profile(tmp_path / Path(group["profile"])).model.samples
+    assert Lens.load(tmp_path / Path(group["profile"])).model.samples
 
 
 # --- sorting -----------------------------------------------------------------------------------

@@ -18,7 +18,8 @@ from lensmodel.cli.main import app
 from lensmodel.core.files import from_json
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile, save_profile
+from lensmodel.lens import Lens
+from lensmodel.model import LensModel
 from lensmodel.report.lens_report import LensReport, lens_report, provenance
 
 NAME = "my-24mm.lensprofile"
@@ -34,7 +35,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
                 place = FieldPosition(r, 2.0 * math.pi * k / 5 + r)
                 kernel = gaussian(15, np.eye(2) * (0.5 + 1.5 * r + 2.0 / aperture))
                 samples.append(PsfSample(kernel, place, LensSettings(aperture=aperture), photo=photo))
-    save_profile(tmp_path / NAME, LensProfile(LensModel.fit(samples)))
+    Lens(LensModel.fit(samples)).save(tmp_path / NAME)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

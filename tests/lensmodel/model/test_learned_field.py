@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from lab.kernels import distance, gaussian
 from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, rms_width
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.lens import Lens
+from lensmodel.model import LensModel
 from lensmodel.model.learned_field import NEAREST
 from lensmodel.neural import FieldAnswer, FieldNetwork
 
@@ -201,9 +202,9 @@ def test_samples_without_a_token_are_answered_by_regression(network: SmallNetwor
 def test_a_profile_gives_the_same_answers(network: SmallNetwork, tmp_path: Path) -> None:
     chart = PsfSample(delta(15), PLACES[0], F2, photo="chart", estimator="points/1", error=0.1)
     before = LensModel.fit([*photo("a", 1), chart])
-    save_profile(tmp_path / "a.lensprofile", LensProfile(before))
+    Lens(before).save(tmp_path / "a.lensprofile")
 
-    after = load_profile(tmp_path / "a.lensprofile").model
+    after = Lens.load(tmp_path / "a.lensprofile").model
 
     for place in PLACES:
         a, b = before.query(place, F2, 31), after.query(place, F2, 31)

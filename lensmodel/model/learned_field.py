@@ -51,6 +51,8 @@ class LearnedField:
         self._tree = lru_cache(maxsize=4)(self._tree_of)
         self._memory = lru_cache(maxsize=_MEMORIES)(self._memory_of)
         self._answer = lru_cache(maxsize=_ANSWERS)(self._answer_of)
+        kept = len(samples) if len(samples) < NEAREST else _MEMORIES * NEAREST
+        self.nbytes = self._tokens.nbytes + len(samples) * _ROW_BYTES + kept * _KEY_BYTES  # at most
 
     def _tokens_of(
         self, samples: Sequence[PsfSample], patches: Sequence[EncodedPatch]
@@ -115,10 +117,3 @@ class LearnedField:
 
     def _of_pitch(self, pitch_um: float) -> NDArray[np.bool_]:
         return np.abs(self._pitch / pitch_um - 1.0) <= camera_bodies.SAME
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes kept, with all that questions may add."""
-        near = min(len(self._tokens), NEAREST)
-        kept = (1 if near < NEAREST else _MEMORIES) * near * _KEY_BYTES
-        return self._tokens.nbytes + len(self._tokens) * _ROW_BYTES + kept

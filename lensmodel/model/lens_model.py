@@ -53,16 +53,15 @@ class LensModel:
 
     @classmethod
     def fit(cls, samples: Sequence[PsfSample], mode: str = "default") -> LensModel:
-        """Build a model from samples; one of a photo and place that is there already is not counted again."""
-        return cls(_distinct(camera_bodies.on_one_circle(samples)), mode)
+        """Build a model from samples."""
+        return cls(camera_bodies.on_one_circle(samples), mode)
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
         """Return the model with more samples; a regression is fitted anew where these are of its kind."""
-        placed = camera_bodies.on_one_circle((*self.samples, *samples))
-        every = _distinct(placed, known=len(self.samples))
-        if len(every) == len(self.samples):
+        if not samples:
             return self
-        return LensModel(every, self.mode, self._regression)
+        placed = camera_bodies.on_one_circle((*self.samples, *samples))
+        return LensModel(placed, self.mode, self._regression)
 
     def query(
         self,
@@ -178,27 +177,6 @@ def _parted(samples: Sequence[PsfSample], mode: str) -> tuple[list[PsfSample], l
     encoded: dict[Hashable, PsfSample] = {}
     for sample in samples:
         if sample.encoded is not None:
-            encoded.setdefault(_place_of(sample), sample)
+            place = sample.photo, sample.position, sample.settings.with_channel("g")
+            encoded.setdefault(place, sample)
     return list(encoded.values()), [s for s in samples if s.encoded is None]
-
-
-def _place_of(sample: PsfSample) -> Hashable:
-    return sample.photo, sample.position, sample.settings.with_channel("g")
-
-
-def _distinct(samples: Sequence[PsfSample], known: int = 0) -> tuple[PsfSample, ...]:
-    """The first `known` samples, and those of other places and estimators, or encoded ones of new photos."""
-    photos = {s.photo for s in samples[:known] if s.encoded is not None}
-    kept, keys = list(samples[:known]), {_key_of(s) for s in samples[:known]}
-    for sample in samples[known:]:
-        key = _key_of(sample)
-        repeated = key in keys or (sample.encoded is not None and sample.photo in photos)
-        if not (sample.photo and repeated):
-            kept.append(sample)
-        keys.add(key)
-    return tuple(kept)
-
-
-def _key_of(sample: PsfSample) -> Hashable:
-    estimator = "" if sample.encoded is not None else sample.estimator
-    return _place_of(sample), sample.settings.channel, estimator

@@ -127,6 +127,7 @@ class Regression:
         # what the estimators expect of their samples; 0 where they expect nothing
         self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
         self._photos = np.array([s.photo for s in samples])
+        self.nbytes = self._local.splines.nbytes
         self._around = Neighbourhood(points, weights, query.bandwidths(points, mode, factors))
 
     def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:
@@ -175,11 +176,6 @@ class Regression:
         shared = max(expected - scatter, expected / 4.0)
         drift = math.hypot(_DRIFT * max(nearest - 1.0, 0.0), _OUTWARD * outward)
         return min(math.sqrt(own + shared + drift * drift), 1.0)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of stored kernels."""
-        return self._local.splines.nbytes
 
 
 # --- kernels in their local frames ---------------------------------------------------------------

@@ -129,17 +129,6 @@ def test_tokens_of_other_weights_are_made_anew_of_the_statistics(network: SmallN
     assert rms_width(answer.kernel) == pytest.approx(2.0, rel=0.05)
 
 
-@pytest.mark.parametrize("again", ["fit", "added"])
-def test_a_photo_that_comes_twice_changes_nothing(network: SmallNetwork, again: str) -> None:
-    samples = [*photo("a", 1), *photo("b", 2, width=3.0)]
-    once = LensModel.fit(samples)
-    twice = LensModel.fit([*samples, *samples]) if again == "fit" else once.added(photo("b", 2, width=3.0))
-
-    assert len(twice.samples) == len(once.samples)
-    for place in PLACES:
-        assert np.array_equal(once.query(place, F2).kernel, twice.query(place, F2).kernel)
-
-
 def test_keys_are_computed_once_for_each_neighbourhood(network: SmallNetwork) -> None:
     model = LensModel.fit([s for k in range(8) for s in photo(f"p{k}", k, count=96)])
 

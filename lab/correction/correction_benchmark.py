@@ -74,8 +74,7 @@ def run_correct_benchmark(
 ) -> dict[str, Any]:
     """Time the methods on a photo or a part of it, the Richardson-Lucy step, and installed peers."""
     noise = [NoiseModel(1 / 50_000, 1e-6)] * 3
-    window = correction.Roi.of(Frame(*photo.shape[1:]), roi)
-    part = photo[:, window.top : window.top + window.height, window.left : window.left + window.width]
+    part = photo[:, *correction.window_of(Frame(*photo.shape[1:]), roi)]
     small = np.ascontiguousarray(photo[:, :200, :200])
     total = len(methods) + 1 + len(peers)
     results: dict[str, dict[str, float]] = {}
@@ -103,7 +102,7 @@ def run_correct_benchmark(
     on_step(total, total)
     return {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
-        "megapixels": window.height * window.width / 1e6,
+        "megapixels": part[0].size / 1e6,
         "raw": cfa is not None,
         "workers": workers,
         "methods": results,

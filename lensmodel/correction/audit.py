@@ -10,8 +10,7 @@ import numpy as np
 
 from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, Plane, Planes
-from lensmodel.correction.blur import ZERO, Real, UniformBlur, block_sums, interpolated, smooth
-from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.blur import ONE, ZERO, Real, Sensor, UniformBlur, block_sums, interpolated, smooth
 from lensmodel.correction.richardson_lucy import LEAST_CLIPPED
 
 Window: TypeAlias = tuple[slice, slice]
@@ -66,31 +65,13 @@ def held_back(
     sensors: Sequence[Sensor],
     errors: Sequence[float],
     inner: Window,
-) -> tuple[Planes, Audit]:
-    """Audit the correction of a tile and mix its `inner` part back towards the photo as far as it fails.
+) -> tuple[Planes, Plane, Audit]:
+    r"""Mix the `inner` part of a tile's correction back towards the photo as far as it fails an audit.
 
-    Where all is kept, it is exactly the correction. Without `blurs` nothing is re-blurred; see `kept_shares`.
-    """
-    keep, checks = kept_shares(photo, restored, blurs, sensors, errors, inner)
-    part = (slice(None), *inner)
-    before, after = photo[part], restored[part]
-    audit = Audit(float(1.0 - keep.mean(dtype=np.float64)), checks)
-    return after if keep.min(initial=1.0) == 1.0 else (after - before) * keep + before, audit
-
-
-def kept_shares(
-    photo: Planes,
-    restored: Planes,
-    blurs: Sequence[UniformBlur] | None,
-    sensors: Sequence[Sensor],
-    errors: Sequence[float],
-    inner: Window,
-) -> tuple[Plane, dict[str, float]]:
-    r"""Share of the correction of each pixel of `inner` that is kept, and what each check alone holds back.
-
-    With y the photo, x the result, sigma the noise, k the PSF and e its relative error, three figures around
-    each place; D_s is the mean power of second differences along rows and columns at a distance of s pixels,
-    in units in which white noise has its variance::
+    Returned are that part, the share that is kept of each of its pixels, and the audit; where all is kept,
+    the part is exactly the correction. Without `blurs` nothing is re-blurred. With y the photo, x the result,
+    sigma the noise, k the PSF and e its relative error, three figures around each place; D_s is the mean
+    power of second differences along rows and columns at s pixels, in units of the variance of white noise::
 
         re-blur          r = (y - k * x) / sqrt( sigma² + e² (x - k * x)² ), its root mean square, where the
                          photo was measured and did not clip; where half of that of y - k * y exceeds 1, the
@@ -102,28 +83,39 @@ def kept_shares(
 
     Of a correction within the limits all is kept, from twice the limit on nothing, and a share between.
     """
-    y, x = (np.ascontiguousarray(p, dtype=np.float32) for p in (photo, restored))
+    y, x = (np.ascontiguousarray(planes, dtype=np.float32) for planes in (photo, restored))
     shape = (y.shape[1], y.shape[2])
-    noise = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
-    clip = np.array([min(s.clip, 1e9) for s in sensors], dtype=np.float32)
-    keep = np.ones(shape, dtype=np.float32)
-    part = (*inner[0].indices(shape[0])[:2], *inner[1].indices(shape[1])[:2])
-    spikes = _spikes(y, x, noise, clip, _point_gains(blurs), part, keep)
-    checks = {ISOLATED: spikes / keep[inner].size}
-    wide = _around(_powers(y, x, noise, clip))
-    known = wide[2:5].max(axis=0) + np.float32(_NOISE) * wide[5] + np.float32(1e-12)
-    severities = {SPECTRUM: np.sqrt(wide[:2].max(axis=0) / known)}
+    clip = np.array([min(sensor.clip, 1e9) for sensor in sensors], dtype=np.float32)
+    shown = np.minimum(x, clip[:, None, None])
+    noise = np.array([[sensor.noise.shot, sensor.noise.read + 1e-12] for sensor in sensors], dtype=np.float32)
+    variance = noise[:, :1, None] * np.maximum(y, ZERO) + noise[:, 1:, None]
+    before, after = (
+        np.maximum.reduce([_around(_second_differences(plane, distance)) for distance in distances])
+        for plane, distances in ((y.mean(axis=0), (1, 2, _COARSE)), (shown.mean(axis=0), (1, 2)))
+    )
+    before += np.float32(_NOISE) * _around(variance.mean(axis=0) / np.float32(3.0))
+    severities = {SPECTRUM: np.sqrt(after / before)}
     if blurs is not None:
-        severities[REBLUR] = _misfit(y, x, blurs, sensors, errors)
-    blocks = tuple(slice(a // _SIDE, max(-(-b // _SIDE), 1)) for a, b in (part[:2], part[2:]))
+        severities[REBLUR] = _misfit(y, x, variance, blurs, sensors, errors)
+    keep = np.ones(shape, dtype=np.float32)
+    spikes = _spikes(y, shown, variance, _point_gains(blurs))
+    if spikes.any():
+        half, foot = len(_FOOT) // 2, np.outer(_FOOT, _FOOT)
+        wide = np.pad(keep, half)
+        for c, i, j in np.argwhere(spikes):
+            part = wide[i : i + len(_FOOT), j : j + len(_FOOT)]
+            np.minimum(part, ONE - spikes[c, i, j] * foot, out=part)
+        keep = wide[half:-half, half:-half]
+    checks = {ISOLATED: float(spikes[:, *inner].sum(dtype=np.float64) / keep[inner].size)}
+    blocks = tuple(slice(part.start // _SIDE, max(-(-part.stop // _SIDE), 1)) for part in inner)
     for check, severity in severities.items():
-        share = np.clip(
-            np.float32(2.0) - severity / np.float32(LIMITS[check]), np.float32(0.0), np.float32(1.0)
-        )
+        share = np.clip(2.0 - severity / LIMITS[check], 0.0, 1.0).astype(np.float32)
         if share.min() < 1.0:
             np.minimum(keep, interpolated(share, _SIDE, *shape), out=keep)
         checks[check] = float(1.0 - share[blocks].mean(dtype=np.float64))
-    return keep[inner], checks
+    keep, before, after = keep[inner], photo[:, *inner], restored[:, *inner]
+    audit = Audit(float(1.0 - keep.mean(dtype=np.float64)), checks)
+    return after if keep.min(initial=1.0) == 1.0 else (after - before) * keep + before, keep, audit
 
 
 def _point_gains(blurs: Sequence[UniformBlur] | None) -> Real:
@@ -140,135 +132,74 @@ def _point_gains(blurs: Sequence[UniformBlur] | None) -> Real:
 
 
 @jit
-def _powers(y: Real, x: Real, noise: Real, clip: Real) -> Real:
-    """Sums over blocks of the mean of the colours: D_1, D_2 of x, D_1, D_2, D_4 of y, sigma²."""
-    rows, cols = y.shape[1:]
-    third, share, rim = np.float32(1.0 / 3.0), np.float32(1.0 / 12.0), _COARSE
-    luma = np.empty((2, rows, cols + 2 * rim), np.float32)
-    power = np.empty((rows, cols), np.float32)
+def _second_differences(plane: Real, s: int) -> Real:
+    """Power of second differences at s pixels, for white noise its variance; the border repeats."""
+    rows, cols = plane.shape
+    power, share = np.empty((rows, cols), np.float32), np.float32(1.0 / 12.0)
+    wide = np.empty(cols + 2 * s, np.float32)
     for i in range(rows):
-        before, after = luma[0, i, rim : rim + cols], luma[1, i, rim : rim + cols]
+        above, here, below = plane[max(i - s, 0)], plane[i], plane[min(i + s, rows - 1)]
+        wide[:s], wide[s : s + cols], wide[s + cols :] = here[0], here, here[cols - 1]
         for j in range(cols):
-            before[j] = third * (y[0, i, j] + y[1, i, j] + y[2, i, j])
-            after[j] = third * (
-                min(x[0, i, j], clip[0]) + min(x[1, i, j], clip[1]) + min(x[2, i, j], clip[2])
-            )
-            total = noise[0, 1] + noise[1, 1] + noise[2, 1]
-            for c in range(3):
-                total += noise[c, 0] * max(y[c, i, j], ZERO)
-            power[i, j] = third * third * total
-        luma[0, i, :rim], luma[0, i, rim + cols :] = before[0], before[cols - 1]
-        luma[1, i, :rim], luma[1, i, rim + cols :] = after[0], after[cols - 1]
-    of_noise = block_sums(power, _SIDE)
-    sums = np.empty((6, *of_noise.shape), np.float32)
-    sums[5] = of_noise
-    for kind in range(5):
-        plane = luma[1] if kind < 2 else luma[0]
-        s = _COARSE if kind == 4 else 1 + kind % 2
-        for i in range(rows):
-            above, here, below = plane[max(i - s, 0)], plane[i], plane[min(i + s, rows - 1)]
-            for j in range(cols):
-                two = here[rim + j] + here[rim + j]
-                down = above[rim + j] + below[rim + j] - two
-                across = here[rim + j - s] + here[rim + j + s] - two
-                power[i, j] = share * (down * down + across * across)
-        sums[kind] = block_sums(power, _SIDE)
-    return sums
+            two = here[j] + here[j]
+            down, across = above[j] + below[j] - two, wide[j] + wide[j + 2 * s] - two
+            power[i, j] = share * (down * down + across * across)
+    return power
+
+
+def _around(plane: Real, rim: int = 0) -> Real:
+    """Weighted sums over the 9 x 9 blocks around each; zeros outside, so that ratios stay right."""
+    return smooth(block_sums(plane, _SIDE, rim), _WEIGHTS)
 
 
 @jit
-def _spikes(  # noqa: C901 - one pass over the tile, row by row
-    y: Real, x: Real, noise: Real, clip: Real, gains: Real, part: tuple[int, int, int, int], keep: Real
-) -> float:
-    """Lower `keep` around pixels that stand out of a colour; return the sum of what such in `part` lose."""
-    rows, cols = keep.shape
-    zero, one, limit, most = np.float32(0.0), np.float32(1.0), np.float32(_STANDS_OUT), np.float32(_SPIKE)
-    shown, out = np.empty((rows, cols), np.float32), np.zeros(cols, np.float32)
-    least, wide = (most * limit) ** 2, _FOOT.size // 2
-    held = 0.0
-    for c in range(3):
-        shot, read = noise[c, 0], noise[c, 1]
-        for i in range(rows):
-            for j in range(cols):
-                shown[i, j] = min(x[c, i, j], clip[c])
-        for i in range(1, rows - 1):
-            above, here, below = shown[i - 1], shown[i], shown[i + 1]
-            for j in range(1, cols - 1):
-                top = max(above[j - 1], above[j], above[j + 1], here[j - 1], here[j + 1])
-                low = min(above[j - 1], above[j], above[j + 1], here[j - 1], here[j + 1])
-                top = max(top, below[j - 1], below[j], below[j + 1])
-                low = min(low, below[j - 1], below[j], below[j + 1])
-                out[j] = max(here[j] - top, low - here[j], zero)
-            for j in range(1, cols - 1):
-                variance = max(shot * max(y[c, i, j], zero) + read, np.float32(1e-12))
-                if out[j] * out[j] <= least * variance:
+def _spikes(y: Real, shown: Real, variance: Real, gains: Real) -> Real:
+    """What each pixel of a colour loses because it stands out."""
+    lost, most, limit = np.zeros_like(y), np.float32(_SPIKE), np.float32(_STANDS_OUT)
+    for c in range(y.shape[0]):
+        for i in range(1, y.shape[1] - 1):
+            for j in range(1, y.shape[2] - 1):
+                here, left, right = shown[c, i, j], shown[c, i, j - 1], shown[c, i, j + 1]
+                out, least = max(here - max(left, right), min(left, right) - here), limit * most
+                if not out > ZERO or out * out <= least * least * variance[c, i, j]:
                     continue
+                top, low = max(left, right), min(left, right)
+                for k in range(j - 1, j + 2):
+                    top = max(top, shown[c, i - 1, k], shown[c, i + 1, k])
+                    low = min(low, shown[c, i - 1, k], shown[c, i + 1, k])
                 window = y[c, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3]
                 bump = abs(y[c, i, j] - window.sum() / np.float32(window.size))
-                figure = out[j] / (gains[c] * bump + most * np.sqrt(variance))
-                share = min(max(figure / limit - one, zero), one)
-                if part[0] <= i < part[1] and part[2] <= j < part[3]:
-                    held += share
-                for k in range(max(i - wide, 0), min(i + wide + 1, rows) if share > zero else 0):
-                    for l in range(max(j - wide, 0), min(j + wide + 1, cols)):
-                        left = one - share * _FOOT[k - i + wide] * _FOOT[l - j + wide]
-                        keep[k, l] = min(keep[k, l], left)
-    return held
+                allowed = limit * (gains[c] * bump + most * np.sqrt(variance[c, i, j]))
+                lost[c, i, j] = min(max(max(here - top, low - here) / allowed - ONE, ZERO), ONE)
+    return lost
 
 
 def _misfit(
-    y: Planes, x: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor], errors: Sequence[float]
+    y: Planes,
+    x: Planes,
+    variance: Planes,
+    blurs: Sequence[UniformBlur],
+    sensors: Sequence[Sensor],
+    errors: Sequence[float],
 ) -> Real:
     """Root mean square of the residual around each block, the most of all colours."""
-    rows, cols = y.shape[1:]
-    worst = np.zeros((-(-rows // _SIDE), -(-cols // _SIDE)), dtype=np.float32)
-    limit = np.float32(LIMITS[REBLUR] ** 2)
+    worst, limit = np.zeros_like(block_sums(y[0], _SIDE)), np.float32(LIMITS[REBLUR] ** 2)
     for c, (blur, sensor) in enumerate(zip(blurs, sensors, strict=True)):
         rim = blur.reach
-        if min(rows, cols) <= 2 * rim:
+        if min(y.shape[1:]) <= 2 * rim:
             continue  # light from beyond reaches all of it
-
-        inside = slice(rim, rows - rim), slice(rim, cols - rim)
-
-        def spread(plane: Plane, blur: UniformBlur = blur, inside: Window = inside) -> Real:
-            out = np.zeros(plane.shape, dtype=np.float32)
-            out[inside] = blur.forward(plane)
-            return out
-
-        counted = np.zeros((rows, cols), dtype=np.float32)
-        counted[inside] = 1.0
-        if sensor.measured is not None:
-            counted *= sensor.measured
+        before, after, noise = (blur.frame(planes[c]) for planes in (y, x, variance))
+        blurred = blur.forward(x[c])
+        counted = np.ones_like(blurred) if sensor.measured is None else blur.frame(sensor.measured * ONE)
         clipped = y[c] >= np.float32(LEAST_CLIPPED * sensor.clip)
         if clipped.any():
-            counted *= spread(clipped.astype(np.float32)) < _GLOW
-        error = max(errors[c], _MODEL_ERROR)
-        allowed = np.array([sensor.noise.shot, sensor.noise.read, error**2], dtype=np.float32)
-        blurred = spread(x[c])
-        square = _around(_residual(y[c], x[c], blurred, blurred, counted, allowed)[None])[0]
-        number = np.maximum(_around(block_sums(counted, _SIDE)[None])[0], np.float32(1.0))
+            counted = counted * (blur.forward(clipped.astype(np.float32)) < _GLOW)
+        error = np.float32(max(errors[c], _MODEL_ERROR))
+        weight = counted / (noise + np.square(error * (after - blurred)))
+        square = _around(weight * np.square(before - blurred), rim)
+        number = np.maximum(_around(counted, rim), ONE)
         if (square > limit * number).any():  # else it does not matter what the photo itself leaves
-            own = _residual(y[c], x[c], blurred, spread(y[c]), counted, allowed)
-            number = np.maximum(number, _around(own[None])[0] / limit)
+            own = _around(weight * np.square(before - blur.forward(y[c])), rim)
+            number = np.maximum(number, own / limit)
         np.maximum(worst, np.sqrt(square / number), out=worst)
     return worst
-
-
-@jit
-def _residual(y: Real, x: Real, blurred: Real, explained: Real, counted: Real, allowed: Real) -> Real:
-    """Sums over blocks of squares of what is not `explained` over what may be, where it is `counted`."""
-    square = np.empty_like(y)
-    for i in range(y.shape[0]):
-        for j in range(y.shape[1]):
-            left, change = y[i, j] - explained[i, j], x[i, j] - blurred[i, j]
-            variance = allowed[0] * max(y[i, j], ZERO) + allowed[1] + allowed[2] * change * change
-            square[i, j] = counted[i, j] * left * left / max(variance, np.float32(1e-12))
-    return block_sums(square, _SIDE)
-
-
-def _around(totals: Real) -> Real:
-    """Weighted sum over the 9 x 9 blocks around each; zeros outside, so that ratios stay right."""
-    out = np.empty_like(totals)
-    for figures, into in zip(totals, out, strict=True):
-        smooth(figures, _WEIGHTS, into, wrapped=False)
-    return out

@@ -1,4 +1,4 @@
-"""Lens blur of a plane by one kernel, its adjoint, and the periodic canvas on which Fourier methods undo it.
+"""What a photo is modelled by, blur and sensor, and the periodic canvas on which Fourier methods undo blur.
 
 Also what compiled loops share: types, constants, transforms on given buffers, and small filters.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -19,8 +19,9 @@ from scipy import fft
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
 from lensmodel.core.psf import as_kernel, support_radius
-from lensmodel.core.types import Kernel, Plane, Planes
+from lensmodel.core.types import Kernel, NoiseModel, Plane, Planes
 
+Mask = NDArray[np.bool_]
 Real = NDArray[np.float32]
 Complex = NDArray[np.complex64]
 Number: TypeAlias = Any
@@ -93,32 +94,30 @@ def transfer(taps: Real, out: Complex, width: int) -> None:
 
 
 @jit
-def smooth(plane: Real, weights: Real, out: Real, wrapped: bool) -> None:
+def smooth(plane: Real, weights: Real, wrapped: bool = False) -> Real:
     """Filter a plane with odd `weights` along rows and columns; it continues periodically, or with zeros."""
     rows, cols = plane.shape
     half = weights.size // 2
+    out = np.zeros((rows, cols), np.float32)
     line = np.empty(cols + 2 * half, np.float32)
     middle = line[half : half + cols]
     for i in range(rows):
         line[:] = ZERO
         for k in range(-half, half + 1):
-            row = i + k
-            if wrapped:
-                row %= rows
-            elif row < 0 or row >= rows:
-                continue
-            weight = weights[k + half]
-            for j in range(cols):
-                middle[j] += weight * plane[row, j]
+            row = (i + k) % rows if wrapped else i + k
+            if 0 <= row < rows:
+                weight = weights[k + half]
+                for j in range(cols):
+                    middle[j] += weight * plane[row, j]
         if wrapped:
             for j in range(half):
                 line[j] = line[(j - half) % cols + half]
                 line[half + cols + j] = line[j % cols + half]
-        out[i] = ZERO
         for k in range(2 * half + 1):
             weight = weights[k]
             for j in range(cols):
                 out[i, j] += weight * line[j + k]
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +134,7 @@ class Drift:
     origin: tuple[float, float]  # pixel of the tile where the kernel is k
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class UniformBlur:
     """Blur by one kernel, y = k * x, no wrapping.
 
@@ -154,12 +153,21 @@ class UniformBlur:
     kernel: Kernel
     offset: tuple[float, float] = (0.0, 0.0)
     drift: Drift | None = None
-    _spectra: dict[tuple[int, int], NDArray[np.complex64]] = field(
-        default_factory=dict, init=False, repr=False
-    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))
+
+    @cached_property
+    def taps(self) -> Real:
+        """The kernel at its offset, `(2 reach + 1, 2 reach + 1)`."""
+        if self.offset == (0.0, 0.0):
+            return self.kernel.astype(np.float32)
+        rows, cols = (_moved(self.kernel.shape[0], shift, self.reach) for shift in self.offset)
+        return np.asarray(rows @ self.kernel @ cols.T, dtype=np.float32)
+
+    @cached_property
+    def _spectra(self) -> dict[tuple[int, int], Complex]:
+        return {}
 
     @property
     def reach(self) -> int:
@@ -172,25 +180,13 @@ class UniformBlur:
         """Radius in pixels that holds 98 percent of the kernel's light and its shift, and a pixel more."""
         return max(support_radius(self.kernel, 0.98), 1) + math.ceil(max(map(abs, self.offset))) + 1
 
-    def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
+    def spectrum(self, shape: tuple[int, int]) -> Complex:
         """Transfer function on the `rfft2` grid of `shape`, which is no smaller than the kernel; cached."""
         if shape not in self._spectra:
             K = np.empty((shape[0], shape[1] // 2 + 1), dtype=np.complex64)
             transfer(self.taps, K, shape[1])
             self._spectra[shape] = K
         return self._spectra[shape]
-
-    @property
-    def taps(self) -> NDArray[np.float32]:
-        """The kernel at its offset, by Keys' cubic convolution (IEEE Trans. ASSP 29, 1981), `(side, side)`.
-
-        A phase alone would be a sinc, whose tails cross the picture: where the kernel is next to a point,
-        undoing them drew nets of dots around every edge.
-        """
-        if self.offset == (0.0, 0.0):
-            return self.kernel.astype(np.float32)
-        rows, cols = (_moved(self.kernel.shape[0], shift, self.reach) for shift in self.offset)
-        return np.asarray(rows @ self.kernel @ cols.T, dtype=np.float32)
 
     def forward(self, latent: Plane) -> Plane:
         """K * x where every pixel of the kernel meets data: `(h + k - 1, ...)` to `(h, ...)`, float32."""
@@ -221,20 +217,15 @@ class UniformBlur:
 
 
 def _moved(side: int, shift: float, reach: int) -> NDArray[np.float64]:
-    """Matrix that moves samples by `shift`, onto 2 reach + 1 of the same middle: four taps, or one."""
-    whole = math.floor(shift)
-    x = shift - whole
-    taps = (
-        ((2.0 - x) * x - 1.0) * x / 2.0,
-        ((3.0 * x - 5.0) * x * x + 2.0) / 2.0,
-        ((4.0 - 3.0 * x) * x + 1.0) * x / 2.0,
-        (x - 1.0) * x * x / 2.0,
-    )
-    margin = reach - side // 2
-    moved = np.zeros((2 * reach + 1, side))
-    for number, tap in enumerate(taps):
-        moved += tap * np.eye(2 * reach + 1, side, -(margin + whole - 1 + number))
-    return moved
+    """Matrix that moves samples by `shift`, onto 2 reach + 1 of the same middle, by Keys' cubic convolution.
+
+    R. G. Keys, IEEE Trans. ASSP 29, 1981. A phase alone would be a sinc, whose tails cross the picture: where
+    the kernel is next to a point, undoing them drew nets of dots around every edge.
+    """
+    distance = np.arange(-reach, reach + 1)[:, None] - shift - (np.arange(side) - side // 2)
+    x = np.abs(distance)
+    near, far = (1.5 * x - 2.5) * x * x + 1.0, ((2.5 - 0.5 * x) * x - 4.0) * x + 2.0
+    return np.where(x < 1.0, near, np.where(x < 2.0, far, 0.0))
 
 
 def fast_shape(shape: tuple[int, ...]) -> tuple[int, int]:
@@ -242,9 +233,7 @@ def fast_shape(shape: tuple[int, ...]) -> tuple[int, int]:
     return int(fft.next_fast_len(shape[0], real=True)), int(fft.next_fast_len(shape[1], real=True))
 
 
-def transfers(
-    blurs: Sequence[UniformBlur], shape: tuple[int, int], reach: float
-) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+def transfers(blurs: Sequence[UniformBlur], shape: tuple[int, int], reach: float) -> tuple[Complex, Complex]:
     """Return K, `(channel, rows, cols)`, and its change per pixel, `(channel, 2, rows, cols)`, or none.
 
     A solver inverts K alone and takes the change as data. That converges only where the change is smaller
@@ -265,6 +254,55 @@ def transfers(
         most = np.float32(0.5) * np.abs(spectrum)
         np.multiply(rate, np.minimum(most / np.maximum(change, np.float32(1e-9)), ONE), out=rate)
     return K, rates
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensor:
+    """What is known of one plane's sensor: its noise and where it clips.
+
+    Parameters
+    ----------
+    noise : NoiseModel
+        Variance against level.
+    clip : float
+        Level at and above which a value is only a lower bound; infinity where nothing clips.
+    measured : ndarray of bool, shape (H, W), or None
+        Where the sensor measured this plane; demosaicing filled in the rest. `None` for everywhere.
+    edges : tuple of bool
+        Which sides of the plane (top, bottom, left, right) are sides of the frame. At the others a rim as
+        wide as the reach of the blur will be cut off: what lies beyond them need not be solved for.
+
+    Raises
+    ------
+    InvalidInputError
+        If `clip` is no positive level.
+    """
+
+    noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
+    clip: float = float("inf")
+    measured: Mask | None = None
+    edges: tuple[bool, bool, bool, bool] = (True, True, True, True)
+
+    def __post_init__(self) -> None:
+        if not self.clip > 0.0:
+            raise InvalidInputError(f"clip must be a positive level, got {self.clip}")
+
+    @property
+    def surrounded(self) -> bool:
+        """Whether no side of the plane is one of the frame."""
+        return not any(self.edges)
+
+    def variance(self, plane: NDArray[np.floating]) -> Real:
+        """Variance of the noise at each pixel of linear light."""
+        return self.noise.variance(plane).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Planes that were restored together, and the light that a prior took of the data, if there is one."""
+
+    planes: Planes
+    unexplained: Planes | None = None
 
 
 BLOCK: Final = 4  # pixels of a coarse plane's block: coarser than detail, finer than objects (chosen)
@@ -334,46 +372,29 @@ def fitted_halo(cell: tuple[int, int], least: int) -> int:
     return least + min(np.subtract(fast_shape(needed), needed)) // 2
 
 
-@jit
-def block_sums(plane: Real, side: int) -> Real:
-    """Sums over square blocks of a plane's pixels; the last ones may be smaller."""
-    rows, cols = plane.shape
-    sums = np.zeros((-(-rows // side), -(-cols // side)), np.float32)
-    line = np.empty(cols, np.float32)
-    for block in range(sums.shape[0]):
-        line[:] = ZERO
-        for i in range(side * block, min(side * block + side, rows)):
-            for j in range(cols):
-                line[j] += plane[i, j]
-        for j in range(cols):
-            sums[block, j // side] += line[j]
-    return sums
+def block_sums(plane: Real, side: int, rim: int = 0) -> Real:
+    """Sums over square blocks of the pixels of a plane with zeros around it; the last ones may be smaller."""
+    rows, cols = (-(-(extent + 2 * rim) // side) for extent in plane.shape)
+    padded = np.zeros((rows * side, cols * side), dtype=np.float32)
+    padded[rim : rim + plane.shape[0], rim : rim + plane.shape[1]] = plane
+    # one sum over both axes takes three times as long
+    lines = padded.reshape(rows, side, cols * side).sum(axis=1)
+    return np.asarray(lines.reshape(rows, cols, side).sum(axis=2))
 
 
-@jit
 def interpolated(blocks: Real, side: int, rows: int, cols: int) -> Real:
     """Interpolate values of square blocks linearly between their middles, constant beyond these."""
-    plane, line = np.empty((rows, cols), np.float32), np.empty(blocks.shape[1] + 1, np.float32)
-    down, across = _between(rows, side), _between(cols, side)
-    for i in range(rows):
-        above, below = blocks[down[0][i]], blocks[min(down[0][i] + 1, blocks.shape[0] - 1)]
-        for k in range(blocks.shape[1]):
-            line[k] = above[k] + down[1][i] * (below[k] - above[k])
-        line[-1] = line[-2]
-        for j in range(cols):
-            k = across[0][j]
-            plane[i, j] = line[k] + across[1][j] * (line[k + 1] - line[k])
-    return plane
+    for extent in (rows, cols):
+        low, high, share = _between(extent, side)
+        blocks = (blocks[low] + share * (blocks[high] - blocks[low])).T
+    return np.ascontiguousarray(blocks)
 
 
-@jit
-def _between(extent: int, side: int) -> tuple[NDArray[np.int64], Real]:
-    """The block before each pixel, and its distance from that block's middle over that to the next one's."""
-    last = (extent - 1) // side
-    index, share = np.zeros(extent, np.int64), np.zeros(extent, np.float32)
-    for i in range(extent if last > 0 else 0):
-        index[i] = min(max((2 * i - side + 1) // (2 * side), 0), last - 1)
-        start = side * index[i]
-        before, after = start + 0.5 * (side - 1), 0.5 * (start + side + min(start + 2 * side, extent) - 1)
-        share[i] = min(max((i - before) / (after - before), 0.0), 1.0)
-    return index, share
+@lru_cache(maxsize=64)
+def _between(extent: int, side: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Real]:
+    """The blocks before and after each pixel, and the share of the latter, `(extent, 1)`."""
+    starts = np.arange(0, extent, side)
+    middles = (starts + np.minimum(starts + side, extent) - 1) / 2.0
+    at = np.interp(np.arange(extent), middles, np.arange(len(starts)))
+    low = at.astype(np.intp)
+    return low, np.minimum(low + 1, len(starts) - 1), (at - low).astype(np.float32)[:, None]

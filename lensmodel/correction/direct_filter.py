@@ -18,6 +18,8 @@ from lensmodel.correction.blur import (
     Canvas,
     Complex,
     Real,
+    Sensor,
+    Solution,
     UniformBlur,
     block_sums,
     interpolated,
@@ -26,9 +28,7 @@ from lensmodel.correction.blur import (
     to_spectrum,
     transfers,
 )
-from lensmodel.correction.deconvolver import Sensor, Solution
-from lensmodel.correction.expected_gain import frequency_squared, noise_power, ring_power, scene_law
-from lensmodel.correction.posterior import GRID
+from lensmodel.correction.expected_gain import GRID, frequency_squared, noise_power, ring_power, scene_law
 from lensmodel.correction.richardson_lucy import Lights, fill_canvas
 
 _TEXTURE: Final = np.float32(0.87)  # t, see `DirectFilter` (chosen as `cell._SHARE` is)
@@ -73,7 +73,7 @@ class DirectFilter:
     def deconvolve_planes(
         self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
     ) -> Solution:
-        """Restore the colours together; see `ColourDeconvolver`."""
+        """Restore the colours together; see `restore_planes`."""
         lights = Lights.of(blurred, blurs, sensors, _LIGHT_STEPS)
         photo, blurred = blurred, np.ascontiguousarray(blurred if lights is None else lights.rest)
         canvas = Canvas.around(blurred, blurs, surrounded=all(sensor.surrounded for sensor in sensors))
@@ -98,9 +98,8 @@ class DirectFilter:
         over = (_CAREFUL * np.maximum(noise, 1e-12) / laws[:, 0]).astype(np.float32)
         amplified = np.empty(len(x), dtype=np.float32)
         _filter(x, K, over, _rise(canvas.shape, slope), amplified)
-        models = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
-        restored = np.empty_like(blurred)
-        _where_it_stands_out(blurred, x, canvas.margin, models * amplified[:, None], restored)
+        shot, read = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32).T * amplified
+        restored = _where_it_stands_out(blurred, x[:, *canvas.data], shot, read)
         return Solution(restored if lights is None else lights.put_back(photo, restored))
 
 
@@ -109,61 +108,34 @@ def _filter(x: Real, K: Complex, over: Real, rise: Real, amplified: Real) -> Non
     """Filter planes in place; `over` times `rise` is n / S, and `amplified` receives mean( |G|² - Re G )."""
     height, half = rise.shape
     X = np.empty((height, half), np.complex64)
-    xx = X.view(np.float32)
     for c in range(x.shape[0]):
-        k = K[c].view(np.float32)
         to_spectrum(x[c], X)
         mean = X[0, 0]
         amplified[c] = ZERO
         for i in range(height):
             changed = ZERO
             for j in range(half):
-                re, im = 2 * j, 2 * j + 1
-                a, b = k[i, re], k[i, im]
-                ratio = over[c] * rise[i, j]
-                power = a * a + b * b + _FLOOR
-                scale = ONE / (power + ratio)
-                gain, turn = (a + _TEXTURE * ratio) * scale, -b * scale
-                changed += gain * gain + turn * turn - gain
-                p, q = xx[i, re], xx[i, im]
-                xx[i, re], xx[i, im] = gain * p - turn * q, gain * q + turn * p
+                k, ratio = K[c, i, j], over[c] * rise[i, j]
+                scale = ONE / (k.real * k.real + k.imag * k.imag + _FLOOR + ratio)
+                gain = (np.conj(k) + _TEXTURE * ratio) * scale
+                changed += gain.real * gain.real + gain.imag * gain.imag - gain.real
+                X[i, j] *= gain
             amplified[c] += changed / np.float32(height * half)
         X[0, 0] = mean
         to_plane(X, x[c])
 
 
-@jit
-def _where_it_stands_out(y: Real, x: Real, margin: int, noise: Real, out: Real) -> None:
-    """Mix planes and their filtered ones on a canvas by what the change costs in `noise`."""
-    channels, rows, cols = y.shape
-    part = np.float32(1.0 / channels)
-    power, expected = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    change = np.empty(cols, np.float32)
-    for i in range(rows):
-        change[:] = ZERO
-        expected[i] = ZERO
-        for c in range(channels):
-            before, after = y[c, i], x[c, margin + i, margin : margin + cols]
-            shot, read = noise[c, 0] * part * part, noise[c, 1] * part * part
-            for j in range(cols):
-                change[j] += part * (after[j] - before[j])
-                expected[i, j] += shot * max(before[j], ZERO) + read
-        for j in range(cols):
-            power[i, j] = change[j] * change[j]
-    blocks, share = block_sums(power, _BLOCK), block_sums(expected, _BLOCK)
-    wider, costs = np.empty_like(blocks), np.empty_like(blocks)
-    smooth(blocks, _AROUND, wider, False)
-    smooth(share, _AROUND, costs, False)
-    for i in range(blocks.shape[0]):
-        for j in range(blocks.shape[1]):
-            cost = _SURE * costs[i, j] / max(wider[i, j], np.float32(1e-20))
-            share[i, j] = min(max(ONE - cost, ZERO), ONE)
-    kept = interpolated(share, _BLOCK, rows, cols)
-    for i in range(rows):
-        for c in range(channels):
-            before, after, into = y[c, i], x[c, margin + i, margin : margin + cols], out[c, i]
-            for j in range(cols):
-                into[j] = before[j] + kept[i, j] * (after[j] - before[j])
+def _where_it_stands_out(y: Planes, x: Planes, shot: Real, read: Real) -> Planes:
+    """Mix planes and their filtered ones by what the change costs in noise."""
+    change, number = x - y, np.float32(len(y))
+    expected = np.einsum("c,cij", shot, np.maximum(y, ZERO)) + read.sum()
+    power, cost = (
+        smooth(block_sums(plane, _BLOCK), _AROUND)
+        for plane in (np.square(change.sum(axis=0) / number), expected / number**2)
+    )
+    share: Real = np.clip(ONE - _SURE * cost / np.maximum(power, np.float32(1e-20)), ZERO, ONE)
+    change *= interpolated(share, _BLOCK, *y.shape[1:])
+    return y + change
 
 
 @lru_cache(maxsize=16)

@@ -9,13 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.core.numerics import jit
 from lensmodel.core.types import Planes
-from lensmodel.correction.blur import ONE, ZERO, Canvas, Number, Real, smooth
-from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.blur import ONE, ZERO, Canvas, Mask, Real, Sensor, smooth
 from lensmodel.correction.expected_gain import wiener_spectrum
-
-Mask = NDArray[np.bool_]
 
 _WINDOW: Final = 2.0
 """Sigma in pixels of windows: ten of red or blue each (chosen; squares would show the mosaic's pattern)."""
@@ -67,52 +63,30 @@ def refill(
         known = np.zeros(shape, dtype=np.float32)
         known[canvas.data] = measured
         guide = K[c] * sharp
-        guide /= np.maximum(np.abs(guide) / light, np.float32(1.0))
+        guide /= np.maximum(np.abs(guide) / light, ONE)
         p = np.asarray(fft.irfft2(guide, shape), dtype=np.float32)
-        predicted = np.empty_like(p)
-        _lines(y[c], p, known, _GAUSSIAN, _RIDGE, predicted)
-        residual = known * (y[c] - predicted)
-        share, between = np.empty_like(p), np.empty_like(p)
-        smooth(known, _BETWEEN, share, wrapped=True)
-        smooth(residual, _BETWEEN, between, wrapped=True)
-        predicted += between / np.maximum(share, np.float32(1e-3))
+        predicted = _lines(y[c], p, known)
+        residual = smooth(known * (y[c] - predicted), _BETWEEN, True)
+        predicted += residual / np.maximum(smooth(known, _BETWEEN, True), np.float32(1e-3))
         np.copyto(y[c][canvas.data], predicted[canvas.data], where=~measured)
 
 
-@jit
-def _lines(y: Real, p: Real, known: Real, weights: Real, least: Number, out: Real) -> None:
+def _lines(y: Real, p: Real, known: Real) -> Real:
     """A p + b of each window's least squares over known pixels, its slope pulled to that of one hue."""
-    rows, cols = y.shape
-    sums = np.empty((5, rows, cols), np.float32)
-    part = np.empty((rows, cols), np.float32)
-    tiny, small, most = np.float32(1e-9), np.float32(1e-6), np.float32(8.0)
-    for number in range(5):
-        for i in range(rows):
-            for j in range(cols):
-                k, a, b = known[i, j], p[i, j], y[i, j]
-                if number == 1:
-                    k *= a
-                elif number == 2:
-                    k *= b
-                elif number == 3:
-                    k *= a * b
-                elif number == 4:
-                    k *= a * a
-                part[i, j] = k
-        smooth(part, weights, sums[number], wrapped=True)
-    for i in range(rows):
-        for j in range(cols):
-            share = np.float32(1.0) / max(sums[0, i, j], tiny)
-            mean_p, mean_y = sums[1, i, j] * share, sums[2, i, j] * share
-            ridge = least * mean_p * mean_p + tiny
-            hue = min(max(mean_y / max(mean_p, small), np.float32(0.0)), most)
-            covariance = sums[3, i, j] * share - mean_p * mean_y + ridge * hue
-            slope = covariance / (sums[4, i, j] * share - mean_p * mean_p + ridge)
-            out[i, j] = mean_y + slope * (p[i, j] - mean_p)
+    a, b = known * p, known * y
+    share, mean_p, mean_y, py, pp = (smooth(part, _GAUSSIAN, True) for part in (known, a, b, a * y, a * p))
+    share = np.reciprocal(np.maximum(share, np.float32(1e-9)))
+    mean_p *= share
+    mean_y *= share
+    ridge = _RIDGE * mean_p * mean_p + np.float32(1e-9)
+    hue = np.clip(mean_y / np.maximum(mean_p, np.float32(1e-6)), ZERO, np.float32(8.0))
+    covariance = py * share - mean_p * mean_y + ridge * hue
+    slope = covariance / (pp * share - mean_p * mean_p + ridge)
+    return np.asarray(mean_y + slope * (p - mean_p), dtype=np.float32)
 
 
 def spread_grain(
-    photo: Planes, left: Planes, clipped: NDArray[np.bool_], sensors: Sequence[Sensor], light: Real
+    photo: Planes, left: Planes, clipped: Mask, sensors: Sequence[Sensor], light: Real
 ) -> Planes:
     """What a prior took of a mosaic, to be added back: grain in light of no colour; `left` is overwritten.
 
@@ -132,114 +106,50 @@ def spread_grain(
     for c, sensor in enumerate(sensors):
         if sensor.measured is not None:
             known[c] &= sensor.measured
+    scale = light[:, None, None]
     noise = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
-    out = np.empty_like(photo)
-    _spread_grain(photo, left, known, clipped, noise, light, out)
+    variance = noise[:, :1, None] * np.maximum(photo, ZERO) + noise[:, 1:, None]
+    grain = np.maximum(np.sqrt(noise[:, 0] * light + noise[:, 1]) / light, np.float32(1e-9))
+    weights = _LUMA * np.sqrt(light)
+    weights /= weights.sum()
+    white = np.sqrt(np.square(grain) @ weights)
+    square = np.einsum("c,cij", weights / light**2, variance)
+
+    there = ONE - np.maximum.reduce(clipped, dtype=np.float32)
+    luma = there * np.einsum("c,cij", weights / light, left)
+    share = np.maximum(smooth(there, _BINOMIAL), np.float32(1e-3))
+    fine = there * (luma - smooth(luma, _BINOMIAL) / share)
+    t = np.clip((_over_noise(fine * fine, square) - _NOISE) / (_DETAIL - _NOISE), ZERO, ONE)
+    kept = ONE - t * t * (np.float32(3.0) - t - t)  # 0 where the power of detail is in it
+    fine = kept * _within(fine, _GRAIN * np.sqrt(square))
+
+    left *= known
+    coarse = np.empty_like(left)
+    for into, plane, own in zip(coarse, left, known.astype(np.float32), strict=True):
+        np.divide(smooth(plane, _BINOMIAL), np.maximum(smooth(own, _BINOMIAL), np.float32(1e-3)), out=into)
+    left -= coarse
+    measured = known * _within(left, _GRAIN * np.sqrt(variance)) * (ONE - kept)
+    coarse /= scale
+    luma = np.einsum("c,cij", weights, coarse)
+    coarse -= luma
+    hued = _AVERAGED * (ONE - weights - weights + np.float32(3.0) * weights**2) / light**2
+    coloured = _over_noise(np.einsum("cij,cij->ij", coarse, coarse), np.einsum("c,cij", hued, variance))
+    coarse *= np.maximum(ONE - _COLOURED / np.maximum(coloured, np.float32(1e-20)), ZERO)
+
+    out = coarse + luma
+    out += np.minimum(grain / white, ONE)[:, None, None] * fine
+    out += np.einsum("ck,kij", np.minimum(grain[:, None] / grain, ONE) / light, measured)
+    out *= scale
+    out[clipped] = 0.0
     return out
 
 
-@jit
-def _spread_grain(  # noqa: C901, PLR0912 - a few passes over one tile
-    y: Real, left: Real, known: Mask, clipped: Mask, noise: Real, light: Real, out: Real
-) -> None:
-    """Fill `out` with what to add back of `left`; `known` marks the pixels that a colour was measured at."""
-    channels, rows, cols = y.shape
-    grain, weights = np.empty(channels, np.float32), np.empty(channels, np.float32)
-    for c in range(channels):
-        grain[c] = max(np.sqrt(noise[c, 0] * light[c] + noise[c, 1]) / light[c], np.float32(1e-9))
-        weights[c] = _LUMA[c] * np.sqrt(light[c])
-    weights /= weights.sum()
-    white = np.sqrt((weights * grain * grain).sum())
-    own = np.minimum(grain / white, ONE)
-    luma, fine = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    variance, coloured = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    there, share = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    for i in range(rows):
-        for j in range(cols):
-            total, square, hued, lost = ZERO, ZERO, ZERO, False
-            for c in range(channels):
-                power = (noise[c, 0] * max(y[c, i, j], ZERO) + noise[c, 1]) / (light[c] * light[c])
-                total += weights[c] * left[c, i, j] / light[c]
-                square += weights[c] * power
-                w = weights[c]
-                hued += _AVERAGED[c] * (ONE - w - w + np.float32(channels) * w * w) * power
-                lost = lost or clipped[c, i, j]
-            variance[i, j], coloured[i, j] = square, hued
-            there[i, j], luma[i, j] = ZERO if lost else ONE, ZERO if lost else total
-    smooth(there, _BINOMIAL, share, wrapped=False)
-    smooth(luma, _BINOMIAL, fine, wrapped=False)
-    for i in range(rows):
-        for j in range(cols):
-            mean = fine[i, j] / max(share[i, j], np.float32(1e-3))
-            fine[i, j] = luma[i, j] - mean if there[i, j] > ZERO else ZERO
-    _coarse(left, known, light, weights, out, luma)
-    kept = np.empty((rows, cols), np.float32)
-    for i in range(rows):
-        for j in range(cols):
-            kept[i, j] = fine[i, j] * fine[i, j]
-            there[i, j] = (
-                out[0, i, j] * out[0, i, j] + out[1, i, j] * out[1, i, j] + out[2, i, j] * out[2, i, j]
-            )
-    _over_noise(kept, variance, share)
-    _over_noise(there, coloured, share)
-    for i in range(rows):
-        for j in range(cols):
-            t = min(max((kept[i, j] - _NOISE) / (_DETAIL - _NOISE), ZERO), ONE)
-            kept[i, j] = ONE - t * t * (np.float32(3.0) - t - t)  # 0 where the power of detail is in it
-            q = max(ONE - _COLOURED / max(there[i, j], np.float32(1e-20)), ZERO)
-            for c in range(channels):
-                out[c, i, j] *= q
-    for i in range(rows):
-        for j in range(cols):
-            within = _GRAIN * np.sqrt(variance[i, j])
-            whole = kept[i, j] * min(max(fine[i, j], -within), within)
-            for c in range(channels):
-                out[c, i, j] = light[c] * (luma[i, j] + out[c, i, j] + own[c] * whole)
-        for k in range(channels):
-            for j in range(cols):
-                if not known[k, i, j]:
-                    continue
-                within = _GRAIN * np.sqrt(noise[k, 0] * max(y[k, i, j], ZERO) + noise[k, 1])
-                measured = (ONE - kept[i, j]) * min(max(left[k, i, j], -within), within) / light[k]
-                for c in range(channels):
-                    out[c, i, j] += measured * light[c] * min(ONE, grain[c] / grain[k])
-        for c in range(channels):
-            for j in range(cols):
-                if clipped[c, i, j]:
-                    out[c, i, j] = ZERO
+def _within(planes: Real, bound: Real) -> Real:
+    """Hold planes within a bound of either sign."""
+    return np.minimum(np.maximum(planes, -bound), bound)
 
 
-@jit
-def _coarse(left: Real, known: Mask, light: Real, weights: Real, chroma: Real, luma: Real) -> None:
-    """Local means of the measured residuals as luma and chroma, over the light; they are taken off `left`."""
-    channels, rows, cols = left.shape
-    mask, there = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    luma[:] = ZERO
-    for c in range(channels):
-        for i in range(rows):
-            for j in range(cols):
-                mask[i, j] = ONE if known[c, i, j] else ZERO
-                if not known[c, i, j]:
-                    left[c, i, j] = ZERO
-        smooth(mask, _BINOMIAL, there, wrapped=False)
-        smooth(left[c], _BINOMIAL, chroma[c], wrapped=False)
-        for i in range(rows):
-            for j in range(cols):
-                mean = chroma[c, i, j] / max(there[i, j], np.float32(1e-3))
-                left[c, i, j] -= mean
-                chroma[c, i, j] = mean / light[c]
-                luma[i, j] += weights[c] * chroma[c, i, j]
-    for c in range(channels):
-        for i in range(rows):
-            for j in range(cols):
-                chroma[c, i, j] -= luma[i, j]
-
-
-@jit
-def _over_noise(power: Real, noise: Real, work: Real) -> None:
-    """Turn power into that nearby over the noise nearby, in place."""
-    smooth(power, _AROUND, work, wrapped=False)
-    smooth(noise, _AROUND, power, wrapped=False)
-    for i in range(power.shape[0]):
-        for j in range(power.shape[1]):
-            power[i, j] = work[i, j] / max(power[i, j], np.float32(1e-20))
+def _over_noise(power: Real, noise: Real) -> Real:
+    """Power nearby over the noise nearby."""
+    over: Real = np.maximum(smooth(noise, _AROUND), np.float32(1e-20))
+    return np.divide(smooth(power, _AROUND), over)

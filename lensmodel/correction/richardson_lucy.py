@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, special
 
 from lensmodel.core.errors import InvalidInputError
@@ -22,23 +20,21 @@ from lensmodel.correction.blur import (
     ZERO,
     Canvas,
     Complex,
+    Mask,
     Number,
     Real,
+    Sensor,
     UniformBlur,
     fast_shape,
     smooth,
     through,
 )
-from lensmodel.correction.deconvolver import Sensor
 
 Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 """How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""
 
-_Response: TypeAlias = tuple[Real, Number, Number]
-
 _ACCELERATIONS: Final = get_args(Acceleration)
 _ALPHA_MAX: Final = 0.9  # of the fixed extrapolation; above it the noise is accelerated as well
-_SHARPNESS: Final = 50.0  # a of the sensor response: it bends over a tenth of the clipping level (chosen)
 _REACH_FLOOR: Final = 0.05
 """Share of the largest F^T 1, the least to divide by (chosen: less lets noise explode, more darkens rims)."""
 _LIGHT: Final = 0.9
@@ -47,6 +43,15 @@ _TINY: Final = np.float32(1e-6)  # saturations: least light to divide by (chosen
 _LEAST_PREDICTED: Final = np.float32(0.1)  # of the datum: a step raises light tenfold at most (chosen)
 _SOFT: Final = special.softmax(-(np.arange(-10, 11) ** 2) / 18.0).astype(np.float32)
 """Weights that soften the places of lights: a Gaussian of 3 pixels (chosen)."""
+
+_SHARPNESS: Final = 50.0  # a of the sensor response: it bends over a tenth of the clipping level (chosen)
+_OVER: Final = np.linspace(-15.0, 25.0, 4097)  # a (z - t): to a millionth, R is z below and t above
+_BEND: Final = np.stack(
+    [1.0 + (_OVER - np.logaddexp(0.0, _OVER)) / _SHARPNESS, special.expit(-_OVER)], dtype=np.float32
+)
+"""R and R' there, over the clipping level: a logarithm and two exponentials for each pixel of a blown area
+would take ten times as long as all transforms."""
+_FIRST, _PER_LIGHT = np.float32(1.0 - 15.0 / _SHARPNESS), np.float32(_SHARPNESS * 4096 / 40.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,216 +131,100 @@ def richardson_lucy_steps(
     """Take steps of `SaturationAwareRichardsonLucy` from `latent`, each pixel normalised by `reach`.
 
     `lights` says whether to keep what is poorly known about lights out of the update of all other pixels.
+
+    Light whose Poisson noise equals the read noise is added to the data and makes that noise nearly Poisson
+    (D. L. Snyder et al., J. Opt. Soc. Am. A 12, 272-283, 1995); without it the dark parts diverge.
     """
-    base = _background(sensor)
+    noise, clip = sensor.noise, np.float32(sensor.clip)
+    base = np.float32(min(noise.read / noise.shot, 1.0) if noise.shot > 0.0 else 0.0)
     data: Plane = np.ascontiguousarray(np.maximum(blurred, 0.0) + base, dtype=np.float32)
-    count = np.arange(1, steps + 1)
-    fixed = np.minimum((count - 1) / (count + 2), _ALPHA_MAX) * (acceleration == "fixed")
-    shape = fast_shape(latent.shape)
-    latent = np.array(latent, dtype=np.float32, order="C")
-    _steps(
-        latent,
-        data,
-        reach.astype(np.float32),
-        blur.spectrum(shape),
-        np.float32(base),
-        np.float32(sensor.clip),
-        _response(),
-        fixed.astype(np.float32),
-        acceleration == "adaptive",
-        shape[1],
-        lights,
-    )
+    shape, (rows, cols), (high, wide) = fast_shape(latent.shape), latent.shape, data.shape
+    top, left = (rows - high) // 2, (cols - wide) // 2
+    K = blur.spectrum(shape)
+    P, work, calm = np.empty_like(K), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    inside, update = work[top : top + high], work[:rows, :cols]
+    update[:] = latent
+    latent, start = update.copy(), update.copy()
+    share = (ONE / reach).astype(np.float32)
+    change = np.zeros_like(latent)
+    for step in range(1, steps + 1):
+        through(work, P, K, FORWARD, 0, rows, top, top + high)
+        _errors(inside, left, data, base, clip)
+        found = _lights(start, np.float32(_LIGHT) * clip, top) if lights else None
+        if found is not None:
+            clean, soft = found
+            calm[top : top + high] = inside
+            calm[top : top + high, left : left + wide] *= clean
+            through(calm, P, K, BACK, top, top + high, 0, rows)
+        through(work, P, K, BACK, top, top + high, 0, rows)
+        if found is not None:
+            most = calm[:rows, :cols]
+            update[:] = most + (update - most) * soft
+        alpha = min(step / (step + 3), _ALPHA_MAX) if acceleration == "fixed" and step < steps else 0.0
+        if acceleration == "adaptive":
+            before = change
+            change = np.maximum(start * np.maximum(ONE + update * share, ZERO), _TINY) - start
+            norm = float(np.square(before).sum(dtype=np.float64))
+            product = float((change * before).sum(dtype=np.float64))
+            alpha = min(max(product / norm, 0.0), 1.0) if norm > 0.0 else 0.0
+        _advance(start, latent, work, share, np.float32(alpha))
     return latent
 
 
-def _background(sensor: Sensor) -> float:
-    """Read variance over shot variance: the light whose Poisson noise equals the read noise.
-
-    It makes read noise nearly Poisson (D. L. Snyder et al., J. Opt. Soc. Am. A 12, 272-283, 1995); without it
-    the dark parts diverge.
-    """
-    if sensor.noise.shot <= 0.0:
-        return 0.0
-    return min(sensor.noise.read / sensor.noise.shot, 1.0)
-
-
-@lru_cache(maxsize=1)
-def _response() -> _Response:
-    """R and R' at even steps of light over clipping level, and the first and last step.
-
-    Below that range R equals the light and above it the clipping level, to a millionth.
-    """
-    first, last = 1.0 - 15.0 / _SHARPNESS, 1.0 + 25.0 / _SHARPNESS
-    light = np.linspace(first, last, 4097).astype(np.float32)
-    over = _SHARPNESS * (light - 1.0)
-    recorded = light - np.logaddexp(0.0, over) / _SHARPNESS
-    slope = 0.5 * (1.0 - np.tanh(0.5 * over))  # the logistic function without overflow
-    return np.stack([recorded, slope]).astype(np.float32), np.float32(first), np.float32(last)
-
-
-@jit
-def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
-    latent: Real, level: Number, reach: int, clean: Real, soft: Real
-) -> bool:
-    """Find bright sharp pixels: mark what they reach as unclean, and their own places softly.
-
-    Returns whether there are any. `clean` has the size of the data, `soft` that of the latent plane.
-    """
+def _lights(latent: Real, level: Number, reach: int) -> tuple[Mask, Real] | None:
+    """Which data bright sharp pixels do not reach, and their own places softly; None where there are none."""
+    bright = latent >= level
+    if not bright.any():
+        return None
+    # together a disc of a radius of 3 pixels
+    hard = np.any([ndimage.maximum_filter(bright, size) for size in ((5, 5), (7, 1), (1, 7))], axis=0)
+    # a square of the operator's reach covers the kernel without knowing its shape
+    near = ndimage.maximum_filter(hard, 2 * reach + 1)
+    soft = smooth(hard.astype(np.float32), _SOFT)
     rows, cols = latent.shape
-    hard = np.zeros((rows, cols), np.float32)
-    any_light = False
-    for i in range(rows):
-        for j in range(cols):
-            if latent[i, j] >= level:
-                any_light = True
-                for di in range(-3, 4):
-                    for dj in range(-3, 4):
-                        a, b = i + di, j + dj
-                        if di * di + dj * dj <= 9 and 0 <= a < rows and 0 <= b < cols:
-                            hard[a, b] = ONE
-    if not any_light:
-        return False
-    # A square of the operator's reach covers the kernel without knowing its shape. One pass each
-    # way that remembers the last mark costs the same for any reach.
-    across = clean.shape[1]
-    wide = np.zeros((rows, across), np.uint8)
-    for i in range(rows):
-        last = -4 * reach - 4
-        for j in range(cols):
-            if hard[i, j] > ZERO:
-                last = j
-            if j >= 2 * reach and j - last <= 2 * reach:
-                wide[i, j - 2 * reach] = 1
-    for b in range(across):
-        last = -4 * reach - 4
-        for i in range(rows):
-            if wide[i, b]:
-                last = i
-            if i >= 2 * reach:
-                clean[i - 2 * reach, b] = ZERO if i - last <= 2 * reach else ONE
-    smooth(hard, _SOFT, soft, wrapped=False)
-    soft[:] = np.minimum(soft, ONE)
-    return True
+    return ~near[reach : rows - reach, reach : cols - reach], np.minimum(soft, ONE)
 
 
 @jit
-def _errors(light: Real, data: Real, base: Number, clip: Number, response: _Response) -> None:
-    """Error of what a row of light predicts, in place: ( data / (R + base) - 1 ) R'.
-
-    Below the `response` the sensor records the light itself, above it `clip`. A logarithm and two
-    exponentials for each pixel of a blown area would take ten times as long as all transforms.
-    """
-    bend, first, last = response
-    brightest = ZERO
-    for j in range(light.size):
-        brightest = max(brightest, light[j])
-    if brightest <= first * clip:  # no branch in the loop: several pixels at a time
-        for j in range(light.size):
-            light[j] = data[j] / max(max(light[j], ZERO) + base, _LEAST_PREDICTED * data[j], _TINY) - ONE
-        return
-    top = np.float32(bend.shape[1] - 1)
-    share, steps = ONE / clip, top / (last - first)
-    for j in range(light.size):
-        predicted = max(light[j], ZERO)
-        at = min((predicted * share - first) * steps, top)
-        if not at > ZERO:  # a NaN stays one
-            light[j] = data[j] / max(predicted + base, _LEAST_PREDICTED * data[j], _TINY) - ONE
-        else:
-            k = min(np.int32(at), np.int32(bend.shape[1] - 2))
-            part = at - np.float32(k)
-            recorded = clip * (bend[0, k] + part * (bend[0, k + 1] - bend[0, k]))
-            slope = bend[1, k] + part * (bend[1, k + 1] - bend[1, k])
-            light[j] = (data[j] / max(recorded + base, _LEAST_PREDICTED * data[j], _TINY) - ONE) * slope
+def _errors(light: Real, left: int, data: Real, base: Number, clip: Number) -> None:
+    """Error of what rows of light predict, in place: ( data / (R + base) - 1 ) R'; zero beside the data."""
+    rows, cols = data.shape
+    recorded, slope = np.empty(cols, np.float32), np.empty(cols, np.float32)
+    share, last = ONE / clip, np.float32(_BEND.shape[1] - 1)
+    for i in range(rows):
+        row = light[i, left : left + cols]
+        brightest = ZERO
+        for j in range(cols):
+            recorded[j] = max(row[j], ZERO)
+            slope[j] = ONE
+            brightest = max(brightest, row[j])
+        if brightest > _FIRST * clip:
+            for j in range(cols):
+                at = min((recorded[j] * share - _FIRST) * _PER_LIGHT, last)
+                if at > ZERO:  # a NaN stays one
+                    k = min(np.int32(at), np.int32(_BEND.shape[1] - 2))
+                    part = at - np.float32(k)
+                    recorded[j] = clip * (_BEND[0, k] + part * (_BEND[0, k + 1] - _BEND[0, k]))
+                    slope[j] = _BEND[1, k] + part * (_BEND[1, k + 1] - _BEND[1, k])
+        light[i] = ZERO
+        for j in range(cols):
+            predicted = max(recorded[j] + base, _LEAST_PREDICTED * data[i, j], _TINY)
+            row[j] = (data[i, j] / predicted - ONE) * slope[j]
 
 
 @jit
-def _measured_alpha(start: Real, work: Real, share: Real, change: Real) -> Number:
-    """Measure alpha of Biggs and Andrews; `change` holds that of the step before, then that of this one."""
-    rows, cols = start.shape
-    norm = 0.0
-    product = 0.0
+def _advance(start: Real, latent: Real, work: Real, share: Real, alpha: Number) -> None:
+    """Make the step from `start` to `latent`, and extrapolate by `alpha` for the next one, on `work` too."""
+    rows, cols = latent.shape
     for i in range(rows):
-        row_product, row_norm = np.float64(0.0), np.float64(0.0)
         for j in range(cols):
             light = max(start[i, j] * max(ONE + work[i, j] * share[i, j], ZERO), _TINY)
-            now, before = light - start[i, j], change[i, j]
-            row_product += now * before
-            row_norm += before * before
-            change[i, j] = now
-        product += row_product
-        norm += row_norm
-    if not norm > 0.0:
-        return ZERO
-    return np.float32(min(max(product / norm, 0.0), 1.0))
+            start[i, j] = max(light + alpha * (light - latent[i, j]), _TINY)
+            latent[i, j] = light
+            work[i, j] = start[i, j]
+        work[i, cols:] = ZERO
 
 
-@jit
-def _steps(  # noqa: C901 - one pass over memory per loop
-    latent: Real,
-    data: Real,
-    reach: Real,
-    K: Complex,
-    base: Number,
-    clip: Number,
-    response: _Response,
-    alphas: Real,
-    adaptive: bool,
-    width: int,
-    lights: bool,
-) -> None:
-    """Accelerated saturation-aware steps; `latent` is start and result.
-
-    The transforms live on the grid of `K`, `width` columns wide; the latent plane lies in its
-    first corner, the data in the middle of the latent plane. With `adaptive` the extrapolation of each
-    step is measured on the changes of the two before it, and `alphas` only gives their number.
-    """
-    rows, cols = latent.shape
-    high, wide = data.shape
-    top, left = (rows - high) // 2, (cols - wide) // 2
-    bottom, right = top + high, left + wide
-    steps = alphas.shape[0]
-    P = np.empty(K.shape, np.complex64)
-    work = np.zeros((K.shape[0], width), np.float32)
-    calm = np.zeros_like(work) if lights else work
-    start = latent.copy()
-    work[:rows, :cols] = latent
-    share = ONE / reach
-    clean = np.empty_like(data)
-    soft = np.empty_like(latent)
-    change = np.zeros_like(latent) if adaptive else soft
-    for step in range(steps):
-        through(work, P, K, FORWARD, 0, rows, top, bottom)
-        for i in range(high):
-            _errors(work[top + i, left:right], data[i], base, clip, response)
-            work[top + i, :left] = ZERO
-            work[top + i, right:] = ZERO
-        split = lights and _lights(start, np.float32(_LIGHT) * clip, top, clean, soft)
-        if split:
-            for i in range(high):
-                calm[top + i] = ZERO
-                for j in range(wide):
-                    calm[i + top, j + left] = work[i + top, j + left] * clean[i, j]
-            through(calm, P, K, BACK, top, bottom, 0, rows)
-        through(work, P, K, BACK, top, bottom, 0, rows)
-        if split:
-            for i in range(rows):
-                for j in range(cols):
-                    work[i, j] = calm[i, j] + (work[i, j] - calm[i, j]) * soft[i, j]
-        alpha = alphas[step + 1] if step + 1 < steps else ZERO
-        if adaptive:
-            alpha = _measured_alpha(start, work, share, change)
-        for i in range(rows):
-            for j in range(cols):
-                light = max(start[i, j] * max(ONE + work[i, j] * share[i, j], ZERO), _TINY)
-                ahead = max(light + alpha * (light - latent[i, j]), _TINY)
-                latent[i, j] = light
-                start[i, j] = ahead
-                work[i, j] = ahead
-            work[i, cols:] = ZERO
-
-
-Mask = NDArray[np.bool_]
 Window = tuple[slice, slice]
 
 LEAST_CLIPPED: Final = 0.98  # of the clipping level: demosaicing leaves clipped light a little below (chosen)
@@ -380,18 +269,13 @@ class Lights:
         that the lens may have spread (`compact`); broad clipped areas count as light at saturation. Positive
         and unregularised, x is a poor picture, so only what lies above t is taken from it.
         """
-        if not any(
-            plane.max() >= np.float32(sensor.clip) for plane, sensor in zip(tile, sensors, strict=True)
-        ):
+        colours = list(zip(tile, blurs, sensors, strict=True))
+        if not any(plane.max() >= np.float32(sensor.clip) for plane, _, sensor in colours):
             return None
-        rest, beyond, glow = tile.copy(), np.zeros_like(tile), np.zeros_like(tile)
-        for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
-            clipped = np.asarray(plane >= np.float32(sensor.clip))
-            spread = positive(blur)
-            for window, own in regions(compact(clipped, blur.spread), spread.reach):
-                _estimate(window, own, plane, clipped, spread, sensor, steps, (rest[c], beyond[c], glow[c]))
-            rest[c] -= np.where(clipped, np.float32(0.0), glow[c])
-        return cls(rest, beyond, glow, np.array([_spread(blur) for blur in blurs], dtype=np.float32))
+        rest, beyond, glow = np.stack([_estimated(*colour, steps) for colour in colours], axis=1)
+        near = [slice(max(blur.kernel.shape[0] // 2 - 1, 0), blur.kernel.shape[0] // 2 + 2) for blur in blurs]
+        spread = [1.0 - blur.kernel[part, part].sum() for blur, part in zip(blurs, near, strict=True)]
+        return cls(rest, beyond, glow, np.array(spread, dtype=np.float32))
 
     def put_back(self, photo: Planes, restored: Planes) -> Planes:
         """Add the light to the restored rest.
@@ -455,54 +339,29 @@ def positive(blur: UniformBlur) -> UniformBlur:
     return UniformBlur(as_kernel(np.maximum(moved, 0.0)))
 
 
-def _spread(blur: UniformBlur) -> float:
-    """Share of a kernel outside its middle 3 x 3 pixels."""
-    middle = blur.kernel.shape[0] // 2
-    near = slice(max(middle - 1, 0), middle + 2)
-    return 1.0 - float(blur.kernel[near, near].sum())
-
-
-def _estimate(
-    window: Window,
-    own: Mask,
-    plane: Real,
-    clipped: Mask,
-    blur: UniformBlur,
-    sensor: Sensor,
-    steps: int,
-    into: tuple[Real, Real, Real],
-) -> None:
-    """Estimate the light of one region of one colour; update `into`: rest, light beyond saturation, glow."""
-    rest, beyond, glow = into
-    data, lost = np.ascontiguousarray(plane[window]), clipped[window]
-    latent, reach = first_guess(data, blur)
-    measured = np.minimum(blur.adjoint((~lost).astype(np.float32)), reach)
-    full = float(reach.max())
-    measured = np.where(
-        measured < _UNSEEN * full, reach, np.maximum(measured, np.float32(_LEAST_SEEN * full))
-    )
-    latent = richardson_lucy_steps(latent, data, measured, blur, sensor, steps=steps)
-    below = np.minimum(latent, np.float32(sensor.clip))
-    excess = np.where(own, latent - below, np.float32(0.0))
-    bound = np.maximum(data, np.float32(0.0)) + _SIGMAS * np.sqrt(sensor.variance(data))
-    excess, spread = _believable(excess, np.where(lost, np.float32(np.inf), bound), blur)
-    glow[window] += spread
-    beyond[window] += blur.frame(excess)
-    answered = lost & np.asarray(blur.frame(own.astype(np.float32)), dtype=np.bool_)
-    rest[window][answered] = np.maximum(blur.forward(below), np.float32(0.0))[answered]
-
-
-def _believable(excess: Real, bound: Real, blur: UniformBlur) -> tuple[Real, Real]:
-    """Return the estimated light and its glow, dimmed where steps ran away; none if that fails."""
-    glow = blur.forward(excess)
-    absurd = ~(np.abs(glow) <= _ABSURD * bound)
-    if absurd.any():
-        share = np.where(absurd, bound / np.where(absurd, np.abs(glow), np.float32(1.0)), np.float32(1.0))
-        excess = excess * ndimage.minimum_filter(np.pad(share, blur.reach, mode="edge"), 2 * blur.reach + 1)
-        glow = blur.forward(excess)
-        if not (np.abs(glow) <= _ABSURD * bound).all():
-            return np.zeros_like(excess), np.zeros_like(glow)
-    return excess, glow
+def _estimated(plane: Real, blur: UniformBlur, sensor: Sensor, steps: int) -> tuple[Real, Real, Real]:
+    """One colour of `Lights`: rest, light beyond saturation, glow."""
+    rest, beyond, glow, spread = plane.copy(), np.zeros_like(plane), np.zeros_like(plane), positive(blur)
+    clip, zero = np.float32(sensor.clip), np.float32(0.0)
+    clipped = np.asarray(plane >= clip)
+    for window, own in regions(compact(clipped, blur.spread), spread.reach):
+        data, lost = np.ascontiguousarray(plane[window]), clipped[window]
+        latent, reach = first_guess(data, spread)
+        measured = np.minimum(spread.adjoint((~lost).astype(np.float32)), reach)
+        full = reach.max()
+        measured = np.where(measured < _UNSEEN * full, reach, np.maximum(measured, _LEAST_SEEN * full))
+        latent = richardson_lucy_steps(latent, data, measured, spread, sensor, steps)
+        below = np.minimum(latent, clip)
+        excess = np.where(own, latent - below, zero)
+        shown = spread.forward(excess)
+        bound = np.maximum(data, zero) + _SIGMAS * np.sqrt(sensor.variance(data))
+        if not (np.abs(shown) <= np.where(lost, np.float32(np.inf), _ABSURD * bound)).all():
+            continue  # the steps ran away: it counts as light at saturation
+        glow[window] += shown
+        beyond[window] += spread.frame(excess)
+        answered = lost & (spread.frame(own.astype(np.float32)) > zero)
+        rest[window][answered] = np.maximum(spread.forward(below), zero)[answered]
+    return rest - np.where(clipped, zero, glow), beyond, glow
 
 
 _DEPTH, _MORE = 4, 8  # reaches of the blur, and pixels: strip that predicts what lies beyond a side (chosen)
@@ -539,27 +398,18 @@ def fill_canvas(
     return y
 
 
-def _extended(
-    plane: NDArray[np.float32], blur: UniformBlur, sensor: Sensor, steps: int
-) -> NDArray[np.float32]:
+def _extended(plane: Real, blur: UniformBlur, sensor: Sensor, steps: int) -> Real:
     """The data, extended by the reach; at the sides of the frame they are replaced by the latent light."""
     wide = blur.reach
-    depth, both = _DEPTH * wide + _MORE, 2 * wide
+    depth = _DEPTH * wide + _MORE
     wider = np.pad(plane, wide, mode="symmetric" if wide <= min(plane.shape) else "edge")
     unclipped = replace(sensor, clip=float("inf"), measured=None)
-
-    def light_of(part: NDArray[np.float32]) -> NDArray[np.float32]:
-        part = np.ascontiguousarray(part)
-        latent, reach = first_guess(part, blur)
-        return richardson_lucy_steps(latent, part, reach, blur, unclipped, steps=steps)
-
     top, bottom, left, right = sensor.edges
-    if left:
-        wider[:, :both] = light_of(plane[:, :depth])[:, :both]
-    if right:
-        wider[:, -both:] = light_of(plane[:, -depth:])[:, -both:]
-    if top:
-        wider[:both] = light_of(plane[:depth])[:both]
-    if bottom:
-        wider[-both:] = light_of(plane[-depth:])[-both:]
+    # quarter turns that lead each side to the top
+    for turn, is_border in ((3, left), (1, right), (0, top), (2, bottom)):
+        if is_border:
+            part = np.ascontiguousarray(np.rot90(np.rot90(plane, turn)[:depth], -turn))
+            latent, reach = first_guess(part, blur)
+            light = richardson_lucy_steps(latent, part, reach, blur, unclipped, steps)
+            np.rot90(wider, turn)[: 2 * wide] = np.rot90(light, turn)[: 2 * wide]
     return wider

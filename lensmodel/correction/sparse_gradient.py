@@ -26,6 +26,8 @@ from lensmodel.correction.blur import (
     Complex,
     Number,
     Real,
+    Sensor,
+    Solution,
     UniformBlur,
     block_sums,
     interpolated,
@@ -33,7 +35,6 @@ from lensmodel.correction.blur import (
     to_spectrum,
     transfers,
 )
-from lensmodel.correction.deconvolver import Sensor, Solution
 from lensmodel.correction.expected_gain import prior, wiener_spectrum
 from lensmodel.correction.mosaic import refill, spread_grain
 from lensmodel.correction.richardson_lucy import Lights, fill_canvas
@@ -304,7 +305,7 @@ class SparseGradient:
     def deconvolve_planes(
         self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
     ) -> Solution:
-        """Restore the colours together; see `ColourDeconvolver`."""
+        """Restore the colours together; see `restore_planes`."""
         lights = Lights.of(blurred, blurs, sensors, _LIGHT_STEPS)
         rest, glow = (blurred, None) if lights is None else (lights.rest, lights.glow)
         light = np.maximum(rest.mean(axis=(1, 2)), 1e-4).astype(np.float32)

@@ -23,10 +23,9 @@ from lensmodel.core.types import (
     Planes,
 )
 from lensmodel.correction import Bounds, Corrected, correct_planes, whole_photo
-from lensmodel.correction.cell import cells
-from lensmodel.correction.deconvolver import Sensor, Solution
-from lensmodel.correction.expected_gain import plan
-from lensmodel.correction.posterior import PsfPosterior
+from lensmodel.correction.blur import Sensor, Solution
+from lensmodel.correction.expected_gain import PsfPosterior, plan
+from lensmodel.correction.whole_photo import cells
 
 FRAME = Frame(152, 208)  # two cells by two
 LARGE = Frame(200, 260)  # two by three
@@ -117,13 +116,13 @@ def left(restored: Planes, seen: Planes, sharp: Planes, where: np.ndarray) -> fl
 def test_cells_sum_to_one_at_every_pixel() -> None:
     total = np.zeros((FRAME.height, FRAME.width))
     for cell in cells(FRAME):
-        total[cell.top : cell.bottom, cell.left : cell.right] += np.outer(cell.rise, cell.run)
+        total[cell.place] += np.outer(cell.rise, cell.run)
 
     np.testing.assert_allclose(total, 1.0, atol=1e-6)
 
 
 def test_cells_of_a_large_frame_stay_within_their_bounds() -> None:
-    sides = [cell.bottom - cell.top for cell in cells(Frame(4000, 6000))]
+    sides = [len(cell.rise) for cell in cells(Frame(4000, 6000))]
 
     assert max(sides) <= 240
     assert min(sides) >= 150
@@ -477,7 +476,7 @@ def test_a_cell_of_which_next_to_nothing_is_left_to_correct_stays_as_it_was(
         del method, rest
         return Solution(tile + np.float32(1e-4) * rng.standard_normal(tile.shape, dtype=np.float32))
 
-    monkeypatch.setattr("lensmodel.correction.cell.restore_planes", hardly)
+    monkeypatch.setattr("lensmodel.correction.whole_photo.restore_planes", hardly)
 
     made = correct_planes(seen, Soft(), FRAME, noise=BASE, bounds=Bounds(texture=0.0))
 

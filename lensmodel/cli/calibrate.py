@@ -16,7 +16,7 @@ from lensmodel.blind.sampling import CalibrationEvent, configured
 from lensmodel.cli import console, files
 from lensmodel.cli.console import Display, UsageError
 from lensmodel.core import processes
-from lensmodel.core.types import ZONE_WORDS, LensSettings
+from lensmodel.core.types import LensSettings
 from lensmodel.patches import selectors
 
 
@@ -112,9 +112,8 @@ def calibrate(
         }
     )
     if lens is not None and len(failed) < len(results):
-        cover = ", ".join(f"{ZONE_WORDS[zone]} {count}" for zone, count in coverage.items())
         places = sum(coverage.values())
-        shown.result(f"{profile}: photos {photo_count}, blur measured at {places} places ({cover})")
+        shown.result(f"{profile}: photos {photo_count}, blur measured at {places} places")
     if lens is None:
         shown.error(
             "no photo could be used, so there is no profile; the lines above say what each photo needs"

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import centred
-from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, StepHook, block_means
+from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, StepHook
 from lensmodel.measured.measurer import Found, Latent, Measurer, Prepared, Window, window_corners, window_psf
-from lensmodel.measured.registration import CLEAR, Warp, match, matched
+from lensmodel.measured.registration import Warp, matched
 from lensmodel.photo import LinearPhoto
 
 USUAL_F_NUMBER: Final = 8.0  # of the closed photo where it does not say: the sharpest of most lenses
@@ -30,7 +30,6 @@ _SIDE: Final = 160  # pixels of a window: the kernel changes in a larger one, a 
 _SPARE: Final = 24  # pixels around a window: deconvolution and interpolation spoil the rim
 _DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised more than eightfold
 _STOPS_APART: Final = 2.0  # least: blur that both photos share is missing in the kernel (chosen)
-_COARSE: Final = 4  # photos are shrunk so far for the first match: a nudged tripod is within reach (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,27 +66,15 @@ class AperturePair(Measurer):
     def register(self, opened: LinearPhoto, closed: LinearPhoto, on_step: StepHook) -> Warp:
         """Lay the closed photo under the open one."""
         plane, reference = (np.asarray(photo.planes[1]) for photo in (opened, closed))
-        shift, clarity = match(
-            *(block_means(np.asarray(each, np.float64), _COARSE) for each in (plane, reference))
-        )
-        if clarity < CLEAR:
-            raise NotEnoughEvidenceError(
-                "the two photos do not show the same scene; take them from a tripod, one after the other"
-            )
-        start = np.eye(3)
-        start[:2, 2] = -_COARSE * np.array(shift)
-        warp = Warp(start, opened.frame)
-        # once: for every window it takes minutes
-        spline = ndimage.spline_filter(reference, order=3, mode="mirror")
 
         def shown(bent: Warp, corner: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.floating]:
             pixels = (at + np.arange(float(n)) for at, n in zip(corner, shape, strict=True))
             places = bent(*np.meshgrid(*pixels, indexing="ij"))
-            return np.asarray(ndimage.map_coordinates(spline, places, prefilter=False, mode="mirror"))
+            return np.asarray(ndimage.map_coordinates(reference, places, order=1, mode="mirror"))
 
-        half = self.side // 2
+        warp, half = Warp(np.eye(3), opened.frame), self.side // 2
         corners = window_corners(plane.shape, self.side, plane.shape[1] // half, plane.shape[0] // half, 8)
-        for degree in (1, 1, 3):
+        for degree in (0, 1, 3):
             warp = matched(warp, shown, plane, corners, self.side, degree, on_step)
         return warp
 

@@ -120,7 +120,7 @@ def matched(
         if good.sum() < max(_FEWEST_MATCHES, used.sum()):
             raise NotEnoughEvidenceError(
                 f"only {int(good.sum())} of {len(corners)} windows of the photo match the reference; "
-                "photograph it flat, in focus and without anything before it"
+                "photograph it flat, in focus and without anything before it, a pair from a tripod"
             )
         terms = np.linalg.lstsq(basis[good], wanted[good], rcond=None)[0]
         left = np.hypot(*(wanted - basis @ terms).T) / warp.scale(*warp.frame.center)

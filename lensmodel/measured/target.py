@@ -1,26 +1,20 @@
 """PSFs from a photo of the known target: found, registered, its light and its tones fitted, solved.
 
-1. The four discs give a homography for each of the four ways to turn the page, and for each number of
-   samples that pages have; that whose noise is in the photo is the one.
-2. Windows all over the page are matched with it, and a polynomial takes what the lens bends.
-3. In each window, the light that falls on the page is a smooth function of the place, and the print has
-   tones: light = E(p) * (t1 R + t2 R² + t3 R³), where R is the page's reflectance.
-4. The kernel between that picture and the pixels that were measured: `solve`.
+The page is band-limited noise with a disc in each corner. Every sample of the noise is drawn on its own, so
+that the page holds all spatial frequencies up to half a cycle a sample equally. It has no size of its own:
+what must fit is the number of samples along its long side, about as many as the page takes pixels in the
+photo. Fewer leave the finest blur unseen; more are finer than pixels and lost.
 
-A quadratic fitted to the light of a window alone would follow the slow waves of the noise itself, and a
-hundredth of wrong light becomes a tenth of wrong kernel. What is printed is known, so with a kernel k that is
-nearly right
+The discs give a homography for each way to turn each page that is known; that whose noise is in the photo is
+the one. Windows are matched with it, and a polynomial takes what the lens bends. In a window the light that
+falls on the page is a smooth function of the place, and the print has tones of its reflectance R:
+light = E(p) (t1 R + t2 R² + t3 R³). A quadratic fitted to the light alone would follow the slow waves of the
+noise itself, and a hundredth of wrong light becomes a tenth of wrong kernel. But what is printed is known:
+with a kernel k that is nearly right
 
     y(p) = sum_j e_j (k * (q_j R))(p) + sum_j c_j q_j(p) + n(p)
 
-is linear in e_j, the light, and c_j, what the lens and its reflections lay over it; q_j are the terms of
-`quadratic`.
-
-The page is band-limited noise with a disc in each corner. Every sample of the noise is drawn on its own, so
-that the page holds all spatial frequencies up to half a cycle a sample equally, in both directions, and says
-the same of the lens everywhere. It has no size of its own: what must fit is the number of samples along its
-long side, about as many as the page takes pixels in the photo. Fewer leave the finest blur unseen; more are
-finer than pixels and lost.
+is linear in e_j, the light, and c_j, what the lens and its reflections lay over it; q_j are `window_terms`.
 
 Source of the idea: N. Joshi et al., "PSF estimation using sharp edge prediction", CVPR 2008, section 4;
 M. Delbracio et al., IJCV 96, 2012, section 4, who show that white noise determines a PSF best.

@@ -28,7 +28,7 @@ from lensmodel.photo.values import LinearPhoto
 
 logger = logging.getLogger(__name__)
 
-Reason: TypeAlias = Literal["border", "clipped", "dark", "flat", "one-directional", "duplicate"]
+Reason: TypeAlias = Literal["clipped", "dark", "flat", "one-directional", "duplicate"]
 """Why a window was not taken; `duplicate` means that a better one lies too near or the quota is full."""
 
 SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
@@ -240,7 +240,6 @@ def first_reasons(windows: Windows) -> NDArray[np.str_]:
     """Reason of each window from block sums alone, the first that holds; empty where none does."""
     small, large = windows.eigenvalues.T
     tests: list[tuple[Reason, NDArray[np.bool_]]] = [
-        ("border", windows.missing > 0.0),
         ("clipped", windows.clipped > CLIPPED_LIMIT),
         ("dark", windows.dark > DARK_LIMIT),
         ("flat", (windows.contrast < FLAT_CONTRAST) | (large < FLAT_EIGENVALUE)),

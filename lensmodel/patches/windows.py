@@ -1,4 +1,4 @@
-"""The windows of a photo: what is known of each candidate, as arrays.
+"""The windows of a photo: what is known of each candidate, as arrays; and the r-map of Xu and Jia.
 
 One pass over a plane sums over small blocks, from which any window is put together (`windows_of`). The
 spectra of a few are then looked at by themselves (`details_of`).
@@ -6,25 +6,80 @@ spectra of a few are then looked at by themselves (`details_of`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, ndimage
 
 from lensmodel.core.types import Frame, NoiseModel, Plane, StepHook
-from lensmodel.patches.rmap import (
-    GROUPS,
-    R_BINS,
-    WINDOW,
-    automatic_threshold,
-    gradient_noise,
-    r_bin,
-    r_of_gradients,
-    smoothed_gradients,
-)
+
+# --- the r-map -----------------------------------------------------------------------------------
+
+SMOOTHING_PX: Final = 1.0  # of the Gaussian before every gradient: noise would enter r's denominator
+FLAT_CONSTANT: Final = 0.5  # suppresses flat regions, for intensities of 0..1 (Xu and Jia)
+WINDOW: Final = 25  # pixels: the window for which that was chosen
+R_BINS: Final = 16  # of the histogram of r: finer than its threshold has to be (chosen)
+GROUPS: Final = 4  # of gradient directions: Xu and Jia 2010, sec. 3.1
+
+
+def smoothed_gradients(plane: Plane) -> tuple[Plane, Plane, Plane]:
+    """Return the smoothed plane and its central differences along rows and columns."""
+    smooth = np.asarray(ndimage.gaussian_filter(plane, SMOOTHING_PX, truncate=3.0), dtype=np.float32)
+    along_rows, along_cols = (np.asarray(part, dtype=np.float32) for part in np.gradient(smooth))
+    return smooth, along_rows, along_cols
+
+
+def gradient_noise() -> float:
+    """Standard deviation of one smoothed gradient component for white noise of 1, by the filter itself."""
+    impulse = np.zeros((17, 17), dtype=np.float32)
+    impulse[8, 8] = 1.0
+    _, response, _ = smoothed_gradients(impulse)
+    return math.sqrt(float(np.square(response, dtype=np.float64).sum()))
+
+
+def r_of_gradients(along_rows: Plane, along_cols: Plane, size: Plane, scale: float) -> Plane:
+    """Evaluate r from gradients and their moduli; `scale` is the intensity that counts as 1."""
+    pixels = float(WINDOW * WINDOW)
+    sums = [ndimage.uniform_filter(part, WINDOW) * pixels for part in (along_rows, along_cols, size)]
+    return np.asarray(np.hypot(sums[0], sums[1]) / (sums[2] + FLAT_CONSTANT * scale), dtype=np.float32)
+
+
+def r_map(plane: Plane) -> Plane:
+    """Map how useful the edges around each pixel are for kernel estimation, 0..1.
+
+    With N(x) the 25 x 25 neighbourhood of x::
+
+        r(x) = | sum_N grad B | / ( sum_N |grad B| + 0.5 )
+
+    The numerator is the modulus of a vector sum: the two flanks of a bar narrower than the blur cancel, so
+    that r is small on fine texture, which misleads estimation from edges, and large at long isolated steps.
+    The constant holds down flat regions.
+
+    Source: L. Xu and J. Jia, "Two-phase kernel estimation for robust motion deblurring", ECCV 2010, eq. (2);
+    here the plane is smoothed by a Gaussian of 1 px first.
+    """
+    _, along_rows, along_cols = smoothed_gradients(plane)
+    return r_of_gradients(along_rows, along_cols, np.hypot(along_rows, along_cols), 1.0)
+
+
+def r_bin(r: Plane) -> NDArray[np.intp]:
+    """Number of the r-bin of each value, 0 to R_BINS - 1."""
+    return np.minimum((r * R_BINS).astype(np.intp), R_BINS - 1)
+
+
+def automatic_threshold(histogram: NDArray[np.int64], pixels: int, kernel_pixels: int) -> int:
+    """Highest r-bin from which on 0.5 sqrt(N_I N_k) pixels of each direction lie (Xu and Jia, sec. 3.1)."""
+    wanted = 0.5 * math.sqrt(float(pixels) * float(kernel_pixels))
+    kept = histogram[:, ::-1].cumsum(axis=1)[:, ::-1]
+    enough = np.flatnonzero((kept >= wanted).all(axis=0))
+    return int(enough[-1]) if enough.size else 0
+
+
+# --- the first look ------------------------------------------------------------------------------
 
 ORIENTATIONS: Final = 8  # bins of gradient direction over half a turn, with edges enough in each (chosen)
 BLOCKS_A_SIDE: Final = 4  # of a window, which starts at any: finer starts find nearly the same ones (chosen)
@@ -54,10 +109,9 @@ class Windows:
     contrast: NDArray[np.float64]  # (n,), variance of the signal, without slopes, over that of the noise
     level: NDArray[np.float64]  # (n,), mean level and the noise's standard deviation there
     sigma: NDArray[np.float64]
-    # (n,), shares of the pixels above `CLIP_SHARE`, below `DARK_SNR`, and not finite
+    # (n,), shares of the pixels above `CLIP_SHARE` and below `DARK_SNR`
     clipped: NDArray[np.float64]
     dark: NDArray[np.float64]
-    missing: NDArray[np.float64]
 
     def __len__(self) -> int:
         return int(self.rows.size)
@@ -75,8 +129,7 @@ def windows_of(
     height, width = plane.shape
     n, m = height // side, width // side
     row, col = (height - n * side) // 2, (width - m * side) // 2
-    sample = plane[::8, ::8][np.isfinite(plane[::8, ::8])]
-    white = max(float(np.percentile(sample, 99.5)), 1e-3) if sample.size else 1.0
+    white = max(float(np.percentile(plane[::8, ::8], 99.5)), 1e-3)
     step = max(1, _STRIP_PIXELS // (side * width))
     strips = []
     for first in range(0, n, step):  # memory does not grow with the plane
@@ -117,7 +170,6 @@ def windows_of(
         sigma=np.sqrt(noise_variance),
         clipped=sums["clipped"] / area,
         dark=sums["dark"] / area,
-        missing=sums["missing"] / area,
     )
 
 
@@ -127,8 +179,6 @@ def _strip_sums(
     """Sums over the blocks of some rows, (n, m, ...), and a histogram of their edge pixels."""
     above, below = min(_MARGIN, rows.start), min(_MARGIN, plane.shape[0] - rows.stop)
     values = np.array(plane[rows.start - above : rows.stop + below], dtype=np.float32)
-    finite = np.isfinite(values)
-    values[~finite] = 0.0
     smooth, along_rows, along_cols = smoothed_gradients(values)
     size = np.hypot(along_rows, along_cols)
     r = r_of_gradients(along_rows, along_cols, size, white)
@@ -162,7 +212,6 @@ def _strip_sums(
         "square": block_sum(np.square(level, dtype=np.float64)),
         "clipped": block_sum(level >= CLIP_SHARE * clip),
         "dark": block_sum(smooth[inner] < DARK_SNR * sigma),
-        "missing": block_sum(~finite[inner]),
         "histogram": np.bincount(groups, minlength=GROUPS * R_BINS).reshape(GROUPS, R_BINS),
     }
 
@@ -202,9 +251,6 @@ def _polynomials(size: int) -> NDArray[np.float64]:
 SECTORS: Final = 8  # of 22.5 degrees: a line lies in one or two
 BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)  # cycles/pixel (chosen): coarse, middle and fine detail
 BANDS: Final = len(BAND_EDGES) - 1  # the intervals between them
-# bands that blur takes away: lenses leave nearly all below 0.1, demosaicing little above 0.4
-EVIDENCE_EDGES: Final = (0.1, 0.2, 0.3, 0.4)
-
 NON_UNIFORMITY: Final = 0.005  # relative deviation of the gain of pixels: 0.3 to 1 percent by EMVA 1288
 DYNAMIC_RANGE: Final = 2.0**14.8  # of the best sensors: less noise was eaten by rounding or denoising
 
@@ -213,8 +259,8 @@ class Details(NamedTuple):
     """Second look at some windows; every array has one entry a window along axis 0."""
 
     information: NDArray[np.float64]  # (n, BANDS, SECTORS), natural logarithm of mean power over noise
-    # (n,), bits a frequency, log2(1 + signal / noise), between 0.1 and 0.4 cycles/pixel; 0 for noise:
-    # C. E. Shannon, "Communication in the presence of noise", Proc. IRE 37, 1949
+    # (n,), bits a frequency, log2(1 + signal / noise), in the bands that blur takes away, all but the first;
+    # 0 for noise: C. E. Shannon, "Communication in the presence of noise", Proc. IRE 37, 1949
     evidence: NDArray[np.float64]
 
 
@@ -222,39 +268,26 @@ def details_of(plane: Plane, windows: Windows, clip: float, coarse: NoiseModel |
     """Look at windows of a plane; `coarse` is the noise between 0.1 and 0.4 cycles/pixel where it is more."""
     size = windows.size
     slopes = np.linalg.qr(_polynomials(size).reshape(-1, size * size).T)[0]
-    bands, evident = (_sectors(size, edges) for edges in (BAND_EDGES, EVIDENCE_EDGES))
+    fr, fc = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
+    sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
+    band = np.searchsorted(BAND_EDGES, np.hypot(fr, fc), side="right") - 1
+    # Of the column fc = 0 the half spectrum holds both halves: one of them must not count.
+    inside = (band >= 0) & (band < BANDS) & ((fc > 0.0) | (fr > 0.0))
+    number = (band * SECTORS + sector)[inside]
+    count = np.bincount(number, minlength=BANDS * SECTORS).reshape(BANDS, SECTORS)
     fine = np.square(windows.sigma)
     noise = fine if coarse is None else np.maximum(fine, coarse.variance(windows.level))
-    rows = []
+    information, evidence = np.zeros((len(windows), BANDS, SECTORS)), np.zeros(len(windows))
     for i, corner in enumerate(zip(windows.rows.tolist(), windows.cols.tolist(), strict=True)):
         values = np.array(plane[corner[0] :, corner[1] :][:size, :size], dtype=np.float64)
         detrended = (values.ravel() - slopes @ (values.ravel() @ slopes)).reshape(values.shape)
-        power = periodogram(detrended)
-        information = np.log(np.maximum(_means(power, bands)[0] / max(fine[i], 1e-12), 1e-3))
-        mean, count = _means(power, evident)
+        power = np.bincount(number, periodogram(detrended)[inside], count.size).reshape(count.shape)
+        mean = power / np.maximum(count, 1)
+        information[i] = np.log(np.maximum(mean / max(fine[i], 1e-12), 1e-3))
         least = noise[i] + (NON_UNIFORMITY * values.mean()) ** 2 + (clip / DYNAMIC_RANGE) ** 2
-        bits = np.log2(1.0 + np.maximum(mean / max(least, 1e-30) - 1.0, 0.0)) @ count / count.sum()
-        rows.append((information.reshape(BANDS, SECTORS), bits))
-    return Details(*(np.array(column) for column in zip(*rows, strict=True)))
-
-
-def _sectors(size: int, edges: tuple[float, ...]) -> NDArray[np.intp]:
-    """Number of the band and sector of every frequency of `rfft2`, -1 outside."""
-    fr, fc = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
-    sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
-    band = np.searchsorted(edges, np.hypot(fr, fc), side="right") - 1
-    # Of the column fc = 0 the half spectrum holds both halves: one of them must not count.
-    inside = (band >= 0) & (band < len(edges) - 1) & ((fc > 0.0) | (fr > 0.0))
-    return np.where(inside, band * SECTORS + sector, -1)
-
-
-def _means(
-    power: NDArray[np.float64], number: NDArray[np.intp]
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Mean power of each band and sector, and how many frequencies each holds."""
-    inside = number >= 0
-    count = np.bincount(number[inside])
-    return np.bincount(number[inside], power[inside]) / np.maximum(count, 1), count
+        bits = np.log2(1.0 + np.maximum(mean[1:] / max(least, 1e-30) - 1.0, 0.0))
+        evidence[i] = np.average(bits, weights=count[1:])
+    return Details(information, evidence)
 
 
 def periodogram(values: NDArray[np.floating]) -> NDArray[np.float64]:

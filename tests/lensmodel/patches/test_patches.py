@@ -220,15 +220,6 @@ def test_wrong_arguments_are_named(part: Plane, wrong: dict[str, Any], said: str
         select(part, NOISE, **{"frame": Frame(*part.shape), **wrong})
 
 
-def test_windows_with_missing_pixels_are_rejected_as_border(part: Plane) -> None:
-    plane = part.copy()
-    plane[:, :40] = np.nan
-    result = chosen(plane)
-
-    assert all(p.col >= 40 for p in result.patches)
-    assert {r.reason for r in result.rejected if r.col < 40} == {"border"}
-
-
 # ---- evidence
 
 

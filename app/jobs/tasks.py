@@ -40,7 +40,7 @@ from lensmodel.core.names import camera_name
 from lensmodel.core.types import FieldPosition, LensSettings, Planes
 from lensmodel.lens import read_profile
 from lensmodel.model import LensModel
-from lensmodel.neural import FieldNetwork
+from lensmodel.neural.network import FieldNetwork
 from lensmodel.patches import Patch
 from lensmodel.patches.select import Rejection
 from lensmodel.photo.lateral import LateralColour

@@ -15,8 +15,7 @@ from lab.population import library, scenes, sets
 from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.traced import draw, grid_of
 from lensmodel.core.files import write_atomically
-from lensmodel.neural import FieldNetwork
-from lensmodel.neural.network import WEIGHTS
+from lensmodel.neural.network import WEIGHTS, FieldNetwork
 
 
 def _arguments() -> argparse.Namespace:

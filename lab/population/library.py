@@ -21,8 +21,7 @@ from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.wavefronts import RandomLens
 from lensmodel.core.files import atomic
 from lensmodel.core.psf import KINDS, PatchKind
-from lensmodel.neural.network import FAR_M, assembled, outer_cells
-from lensmodel.neural.statistics import to_octant
+from lensmodel.neural.network import FAR_M, assembled, outer_cells, to_octant
 
 Family = Literal["wavefront", "third-order", "traced"]
 FAMILIES: Final[tuple[Family, ...]] = ("wavefront", "third-order", "traced")

@@ -25,8 +25,7 @@ from scipy.special import j1
 from lab.images import to_srgb
 from lab.population.scenes import busiest
 from lensmodel.core.psf import PatchKind
-from lensmodel.neural.network import FINE, SIDE
-from lensmodel.neural.statistics import LENGTH, WINDOW, patch_statistics
+from lensmodel.neural.network import FINE, LENGTH, SIDE, WINDOW, patch_statistics
 from lensmodel.photo.colour import srgb_to_linear
 
 _MARGIN: Final = 8  # pixels around a window that demosaicking and sharpening look at

@@ -17,9 +17,16 @@ from lab.images import zone_masks
 from lab.population.library import FAMILIES, Family, load_shard, numbered
 from lensmodel.core.files import atomic
 from lensmodel.core.types import ZONES
-from lensmodel.neural import FieldAnswer, FieldNetwork
-from lensmodel.neural.network import assembled, outer_cells
-from lensmodel.neural.statistics import from_octant_image, group, octant_of, to_octant_image
+from lensmodel.neural.network import (
+    FieldAnswer,
+    FieldNetwork,
+    assembled,
+    from_octant_image,
+    group,
+    octant_of,
+    outer_cells,
+    to_octant_image,
+)
 
 _UNKNOWN: Final = 0.08  # share of sets whose aperture, and of those whose pitch, is not known
 _POWERS: Final = np.arange(0.84, 1.15, 0.02)

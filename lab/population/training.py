@@ -24,9 +24,19 @@ from torch.nn import functional
 from lab.images import zone_masks
 from lab.population.sets import Lens, Set, draw_set, load_library
 from lensmodel.core.files import write_atomically
-from lensmodel.neural import FieldNetwork, network
-from lensmodel.neural.network import BLOCK, COARSE, CONDITION, DISTANCES, FINE, PLACE, RELATION, RINGS
-from lensmodel.neural.statistics import LENGTH
+from lensmodel.neural import network
+from lensmodel.neural.network import (
+    BLOCK,
+    COARSE,
+    CONDITION,
+    DISTANCES,
+    FINE,
+    LENGTH,
+    PLACE,
+    RELATION,
+    RINGS,
+    FieldNetwork,
+)
 
 WIDTH, HEADS, HIDDEN, COMPONENTS = 192, 6, 384, 224
 ENCODER_BLOCKS, DECODER_BLOCKS = 2, 3

@@ -25,8 +25,7 @@ from lensmodel.core.types import (
     StepHook,
     ignore_step,
 )
-from lensmodel.neural import FieldNetwork, conditions_of
-from lensmodel.neural.statistics import WINDOW, patch_statistics, to_octant
+from lensmodel.neural.network import WINDOW, FieldNetwork, conditions_of, patch_statistics, to_octant
 from lensmodel.patches.select import Patch, Selection, spread_evenly
 from lensmodel.photo.values import LinearPhoto
 

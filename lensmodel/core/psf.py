@@ -157,7 +157,7 @@ KINDS: Final[tuple[PatchKind, ...]] = get_args(PatchKind)
 class EncodedPatch:
     """What a patch of a photo says of the lens without a kernel: the input of attention over many patches."""
 
-    # (n,), statistics of its pixels (`lensmodel.neural.statistics`), turned into the octant of its place
+    # (n,), statistics of its pixels (`lensmodel.neural.network`), turned into the octant of its place
     statistics: npt.NDArray[np.float16]
     # (192,), what the network made of them beside the other patches of the photo
     token: npt.NDArray[np.float16]

@@ -20,7 +20,7 @@ from lensmodel.core.psf import KINDS, EncodedPatch, PatchKind, PsfSample, centre
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, query
 from lensmodel.model.query import Part
-from lensmodel.neural import RING_MIDDLES, FieldAnswer, FieldNetwork, Memory, conditions_of
+from lensmodel.neural.network import RING_MIDDLES, FieldAnswer, FieldNetwork, Memory, conditions_of
 
 NEAREST: Final = 256  # samples that a question attends to (chosen: the patches of three photos)
 

@@ -23,7 +23,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import places_of
 from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Zone
 from lensmodel.model import LensModel, PsfAnswer
-from lensmodel.neural import RING_MIDDLES
+from lensmodel.neural.network import RING_MIDDLES
 from lensmodel.quality import crossing, mtf50_from_kernel, mtf_from_kernel
 from lensmodel.report.centring import Centring, centring
 

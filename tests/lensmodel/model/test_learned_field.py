@@ -21,7 +21,7 @@ from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.lens import Lens
 from lensmodel.model import LensModel
 from lensmodel.model.learned_field import NEAREST
-from lensmodel.neural import FieldAnswer, FieldNetwork
+from lensmodel.neural.network import FieldAnswer, FieldNetwork
 
 F2 = LensSettings(aperture=2.0)
 SIDE = 75

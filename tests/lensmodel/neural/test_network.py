@@ -12,17 +12,19 @@ from scipy import ndimage
 from lab.population.sets import adjusted, judge, load_sets
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.core.types import LensSettings
-from lensmodel.neural import FieldAnswer, FieldNetwork, conditions_of
-from lensmodel.neural.network import WEIGHTS
-from lensmodel.neural.statistics import (
+from lensmodel.neural.network import (
     LENGTH,
     OCTANTS,
+    RELATIVE,
+    WEIGHTS,
     WINDOW,
+    FieldAnswer,
+    FieldNetwork,
+    conditions_of,
     from_octant_image,
     group,
     octant_of,
     patch_statistics,
-    relative_octant,
     to_octant,
     to_octant_image,
     to_octant_place,
@@ -222,8 +224,8 @@ def test_pictures_and_places_turn_alike(octant: int) -> None:
 def test_relation_of_octants_is_the_same_after_any_symmetry() -> None:
     for symmetry in range(OCTANTS):
         moved = octant_of(to_octant_place(np.array(symmetry), OCTANT_PLACES))
-        before = relative_octant(octant_of(OCTANT_PLACES)[:, None], octant_of(OCTANT_PLACES)[None])
-        np.testing.assert_array_equal(relative_octant(moved[:, None], moved[None]), before)
+        before = RELATIVE[octant_of(OCTANT_PLACES)[:, None], octant_of(OCTANT_PLACES)[None]]
+        np.testing.assert_array_equal(RELATIVE[moved[:, None], moved[None]], before)
 
 
 def test_blur_shows_in_every_ring_of_the_spectrum_and_in_the_edges() -> None:

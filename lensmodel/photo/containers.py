@@ -279,10 +279,8 @@ def check_size(width: int, height: int, file_bytes: int, limits: Limits) -> None
             f"{file_bytes} bytes claim to be {width} x {height} pixels; no photograph is packed like that"
         )
     if megapixels > limits.max_megapixels:
-        raise errors.ImageTooLargeError(
-            f"{width} x {height} pixels are {megapixels:.0f} MP; "
-            f"the limit is {limits.max_megapixels:g} MP, scale or crop it"
-        )
+        most = f"the limit is {limits.max_megapixels:g} MP, scale or crop it"
+        raise errors.ImageTooLargeError(f"{width} x {height} pixels are {megapixels:.0f} MP; {most}")
 
 
 # --- which kind --------------------------------------------------------------------------------
@@ -319,9 +317,8 @@ def sniff(head: bytes) -> FileKind:
             raise errors.UnsupportedFormatError(f"{kind} files are not read; {_READABLE}")
     if not head:
         raise errors.NotAnImageError(f"the file is empty; {_READABLE}")
-    raise errors.NotAnImageError(
-        f"the first bytes ({head[:8].hex(' ')}) belong to no photo format; {_READABLE}"
-    )
+    said = f"the first bytes ({head[:8].hex(' ')}) belong to no photo format"
+    raise errors.NotAnImageError(f"{said}; {_READABLE}")
 
 
 @contextlib.contextmanager
@@ -452,7 +449,7 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
         raise errors.TruncatedImageError("the PNG has no image data")
     text = found.get(b"iTXt", b"")
     xmp = text[20:].partition(b"\0")[2].partition(b"\0")[2]
-    icc = (_inflated(found[b"iCCP"].partition(b"\0")[2][1:]) or b"") if b"iCCP" in found else None
+    icc = _inflated(found[b"iCCP"].partition(b"\0")[2][1:]) if b"iCCP" in found else None
     known = _OF_SRGB if b"sRGB" not in found else {b"cICP"}  # sRGB goes before gAMA and cHRM
     other = b", ".join(name for name in known if found.get(name, _OF_SRGB[name]) != _OF_SRGB[name])
     if (other and not icc) or found.get(b"cICP", b"")[1:2] in _HDR:
@@ -471,8 +468,8 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     )
 
 
-def png_chunks(buffer: Buffer, *, every: bool = False) -> Iterator[tuple[bytes, int, int]]:
-    """Yield name, start and length of the chunks; of a run of image data only the first, or `every` one."""
+def png_chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
+    """Yield name, start and length of the chunks; a run of image data counts as one."""
     at, count, before = 33, 0, b"IHDR"
     while count < MAX_CHUNKS:
         head = bytes(buffer[at : at + 8])
@@ -483,28 +480,25 @@ def png_chunks(buffer: Buffer, *, every: bool = False) -> Iterator[tuple[bytes, 
             raise errors.TruncatedImageError(f"the PNG ends inside chunk {name!r}; {COPY_AGAIN}")
         if name == b"IEND":
             return
-        again = name == before == b"IDAT"
-        count += not again
-        if every or not again:
-            yield name, at + 8, length
+        yield name, at + 8, length
+        count += not name == before == b"IDAT"
         before, at = name, at + 12 + length
 
 
 def png_picture(data: bytes) -> bytes:
     """A PNG without all that is not its picture: decoders unpack that too, and print what they find amiss."""
-    chunks = png_chunks(data, every=True)
-    kept = (data[start - 8 : start + length + 4] for name, start, length in chunks if name in _OF_PICTURE)
-    return data[:33] + b"".join(kept) + _PNG_END
+    chunks = (data[at - 8 : at + length + 4] for name, at, length in png_chunks(data) if name in _OF_PICTURE)
+    return data[:33] + b"".join(chunks) + _PNG_END
 
 
-def _inflated(packed: bytes) -> bytes | None:
-    """Decompress at most `MAX_BLOCK_BYTES`; `None` where there is more, or damage."""
+def _inflated(packed: bytes) -> bytes:
+    """Decompress at most `MAX_BLOCK_BYTES`; empty where there is more, or damage."""
     inflater = zlib.decompressobj()
     try:
         data = inflater.decompress(packed, MAX_BLOCK_BYTES)
     except zlib.error:
-        return None
-    return data if inflater.eof else None
+        return b""
+    return data if inflater.eof else b""
 
 
 # --- TIFF, DNG and RAW files that look like TIFF -----------------------------------------------
@@ -556,9 +550,8 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
                 return replace(header, coarseness=_read_jpeg(tile, limits).coarseness)
         return header
     if len(every) >= MAX_DIRECTORIES:
-        raise errors.UnsupportedFormatError(
-            f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo"
-        )
+        said = f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo"
+        raise errors.UnsupportedFormatError(said)
     if not _pixels(photo) or not all(photo.keys() & either for either in _STRIPS):
         raise errors.NotAnImageError(
             f"the TIFF gives no size ({header.width} x {header.height}) or no strips: it holds no picture"

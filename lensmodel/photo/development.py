@@ -46,43 +46,37 @@ _UNDECODED: Final = {9: "VC-5 (GoPro GPR)", 52546: "JPEG XL"}
 
 def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
     """Read kind, size and metadata from the header, and refuse what cannot be developed."""
-    path, limits = Path(path), limits or Limits()
-    with _opened(path, limits) as (said, raw):
-        return _info_of(path, said, raw, limits)
+    with _opened(Path(path), limits or Limits()) as (_, _, info):
+        return info
 
 
 @contextlib.contextmanager
-def _opened(path: Path, limits: Limits) -> Iterator[tuple[Said, rawpy.RawPy | None]]:
-    """Open a file once: what its header says, and LibRaw where it is a RAW file."""
+def _opened(path: Path, limits: Limits) -> Iterator[tuple[Said, rawpy.RawPy | None, PhotoInfo]]:
+    """Open a file once: what its header says, LibRaw where it is a RAW file, and both together."""
     with contextlib.ExitStack() as stack:
         said = Said.of(stack.enter_context(containers.opened_header(path, limits)))
-        is_raw = said.header.kind in {"raw", "dng"}
-        yield said, stack.enter_context(opened_raw(path)) if is_raw else None
-
-
-def _info_of(path: Path, said: Said, raw: rawpy.RawPy | None, limits: Limits) -> PhotoInfo:
-    header, metadata = said.header, said.metadata()
-    width, height = header.width, header.height
-    if raw is not None:
-        if packing := _UNDECODED.get(header.compression):
-            remedy = "convert it to a plain DNG or TIFF"
-            raise errors.UnsupportedFormatError(f"RAW data packed as {packing} are not read; {remedy}")
-        width, height = raw.sizes.width, raw.sizes.height
-        if header.camera is not None:
-            metadata = _exposure_of(raw, metadata)
-        containers.check_size(width, height, path.stat().st_size, limits)
-    kind = header.kind.upper()
-    if kind == "JPEG" and header.channels == 4:
-        raise errors.UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
-    if not header.whole:
-        raise errors.TruncatedImageError(f"the {kind} ends before its picture does; {COPY_AGAIN}")
-    if min(width, height) < MIN_SIDE:
-        said_so = f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
-        raise errors.NotAnImageError(said_so)
-    # no camera stores a picture higher than wide and says that it lies
-    upright = raw is None and height > width and metadata.orientation == 1
-    turned = upright and metadata.camera_model is not None
-    return PhotoInfo(header.kind, width, height, metadata, said.is_centred(metadata), turned)
+        header, metadata, raw = said.header, said.metadata(), None
+        kind, width, height = header.kind.upper(), header.width, header.height
+        if header.kind in {"raw", "dng"}:
+            raw = stack.enter_context(opened_raw(path))
+            if packing := _UNDECODED.get(header.compression):
+                remedy = "convert it to a plain DNG or TIFF"
+                raise errors.UnsupportedFormatError(f"RAW data packed as {packing} are not read; {remedy}")
+            width, height = raw.sizes.width, raw.sizes.height
+            if header.camera is not None:
+                metadata = _exposure_of(raw, metadata)
+            containers.check_size(width, height, path.stat().st_size, limits)
+        if kind == "JPEG" and header.channels == 4:
+            raise errors.UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
+        if not header.whole:
+            raise errors.TruncatedImageError(f"the {kind} ends before its picture does; {COPY_AGAIN}")
+        if min(width, height) < MIN_SIDE:
+            said_so = f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
+            raise errors.NotAnImageError(said_so)
+        # no camera stores a picture higher than wide and says that it lies
+        upright = raw is None and height > width and metadata.orientation == 1
+        turned = upright and metadata.camera_model is not None
+        yield said, raw, PhotoInfo(header.kind, width, height, metadata, said.is_centred, turned)
 
 
 def develop(
@@ -118,9 +112,8 @@ def develop(
     ImageTooLargeError
         If it is larger than the limits allow.
     """
-    path, limits = Path(path), limits or Limits()
-    with _opened(path, limits) as (said, raw):
-        info = _info_of(path, said, raw, limits)
+    path = Path(path)
+    with _opened(path, limits or Limits()) as (said, raw, info):
         try:
             if on_info is not None:
                 on_info(info)

@@ -101,21 +101,15 @@ class Said:
             exposure_s=_first_within(1e-7, 1e6, number(0x829A), _quotient(xmp.get("exif:ExposureTime"))),
             taken_at=self._taken_at(),
             orientation=int(_first_within(1.0, 8.0, number(0x0112)) or 1),
-            pixel_pitch_um=self._pixel_pitch_um(),
+            pixel_pitch_um=self._placed()[0],
             artist=text(0x013B) or xmp.get("dc:creator"),
             copyright=text(0x8298) or xmp.get("dc:rights"),
         )
 
-    def is_centred(self, metadata: PhotoMetadata) -> bool:
-        """Tell whether a picture shows its whole sensor or the middle of it, as cameras crop, no program."""
-        pitch, width, height = metadata.pixel_pitch_um, self.header.width, self.header.height
-        if self.header.kind in {"raw", "dng"} or pitch is None:
-            return True
-        if self._was_cut:
-            return False
-        film = self._film_pitch_um()
-        whole = film is not None and abs(pitch / film - 1.0) < 0.05
-        return whole or _is_width_of_sensor(max(width, height) * pitch / 1000.0) or self._zoom > 1.01
+    @property
+    def is_centred(self) -> bool:
+        """Whether a picture shows its whole sensor or the middle of it, as cameras crop, no program."""
+        return self._placed()[1]
 
     def baseline_exposure(self) -> float | None:
         """Stops by which a DNG asks to be brightened, None where it does not say or is absurd."""
@@ -126,15 +120,6 @@ class Said:
         """Whether EXIF declares Adobe RGB, by its ColorSpace or as DCF 2.0 does; what says less is sRGB."""
         space, readers = self.tags.number(0xA001), self.header.tiff
         return space == 2 or (space != 1 and "R03" in [r.below(self.tags, 0xA005).text(1) for r in readers])
-
-    @property
-    def _zoom(self) -> float:
-        """How much of the picture is enlarged from the middle of the sensor: DigitalZoomRatio."""
-        return _first_within(1.0, 20.0, self.tags.number(0xA404)) or 1.0
-
-    @property
-    def _was_cut(self) -> bool:
-        return self.xmp.get("crs:HasCrop") == "True"
 
     def _taken_at(self) -> datetime | None:
         for tag in (0x9003, 0x9004, 0x0132):
@@ -168,35 +153,38 @@ class Said:
         plain = (math.inf if value is not None and value >= 4294967295 else value for value in values)
         return next((value for value in plain if value is not None and value > 0), None)
 
-    def _pixel_pitch_um(self) -> float | None:
-        """Pitch from the focal plane resolution, else from the focal length for 35 mm film.
+    def _placed(self) -> tuple[float | None, bool]:
+        """Pitch of the pixels in micrometres, and whether they are all of the sensor or its middle.
 
-        Programs that scale a photo down rarely correct the former; then width times pitch is the
-        width of no common sensor, and it says nothing. A mosaic was never scaled, only cut.
+        The pitch is from the focal plane resolution, else from the focal length for 35 mm film: its frame is
+        as many times larger as that is longer. Programs that scale a photo down rarely correct the former;
+        then width times pitch is the width of no common sensor, and it says nothing. A mosaic was never
+        scaled, only cut.
 
         Source: CIPA DC-008-2023, tags FocalPlaneXResolution and FocalLengthIn35mmFilm.
         """
-        per_unit, unit = self.tags.number(0xA20E), self.tags.number(0xA210) or 2.0
+        number, header = self.tags.number, self.header
+        zoom = _first_within(1.0, 20.0, number(0xA404)) or 1.0  # of the middle, enlarged: DigitalZoomRatio
+        focal, of_film = number(0x920A), number(0xA405)
+        crop = _first_within(*_CROP_FACTORS, of_film / focal if focal and of_film else None)
+        frame_px = max(math.hypot(header.width, header.height), 1.0)
+        film = crop and _first_within(*_PITCHES_UM, 1000.0 * _FILM_DIAGONAL_MM / crop / frame_px)
+        per_unit, unit = number(0xA20E), number(0xA210) or 2.0
         unit_um = {2.0: 25400.0, 3.0: 10000.0, 4.0: 1000.0, 5.0: 1.0}.get(unit, 0.0)
-        pitch, header = _first_within(*_PITCHES_UM, unit_um / per_unit if per_unit else None), self.header
-        if pitch is not None:
-            pitch /= self._zoom
-            shorter, longer = sorted((header.width, header.height))
-            mosaic = header.kind == "raw" or (header.kind == "dng" and header.channels == 1)
-            # scaled down, a picture keeps the shape of its sensor, 3 : 2 or 4 : 3
-            whole = any(abs(longer / max(shorter, 1) / shape - 1.0) < 0.01 for shape in (1.5, 4.0 / 3.0))
-            width_mm, unscaled = longer * pitch / 1000.0, mosaic or self._was_cut or not whole
-            if _is_width_of_sensor(width_mm) or (unscaled and width_mm <= _SENSORS_MM[-1][1]):
-                return pitch
-        film = self._film_pitch_um()
-        return film and film / self._zoom
-
-    def _film_pitch_um(self) -> float | None:
-        """Pitch of a frame whose diagonal is that of 35 mm film over the crop factor."""
-        focal, film = self.tags.number(0x920A), self.tags.number(0xA405)
-        crop = _first_within(*_CROP_FACTORS, film / focal if focal and film else None)
-        diagonal_px = max(math.hypot(self.header.width, self.header.height), 1.0)
-        return crop and _first_within(*_PITCHES_UM, 1000.0 * _FILM_DIAGONAL_MM / crop / diagonal_px)
+        plane = _first_within(*_PITCHES_UM, unit_um / per_unit if per_unit else None)
+        shorter, longer = sorted((header.width, header.height))
+        mosaic = header.kind == "raw" or (header.kind == "dng" and header.channels == 1)
+        cut = self.xmp.get("crs:HasCrop") == "True"
+        # scaled down, a picture keeps the shape of its sensor, 3 : 2 or 4 : 3
+        scaled = any(abs(longer / max(shorter, 1) / shape - 1.0) < 0.01 for shape in (1.5, 4.0 / 3.0))
+        width_mm = longer * (plane or math.inf) / zoom / 1000.0
+        unscaled = (mosaic or cut or not scaled) and width_mm <= _SENSORS_MM[-1][1]
+        pitch = plane if unscaled or _is_width_of_sensor(width_mm) else film
+        if pitch is None or header.kind in {"raw", "dng"}:
+            return pitch and pitch / zoom, True
+        whole = film is not None and abs(pitch / zoom / film - 1.0) < 0.05
+        known = whole or zoom > 1.01 or _is_width_of_sensor(longer * pitch / zoom / 1000.0)
+        return pitch / zoom, known and not cut
 
 
 def _is_width_of_sensor(width_mm: float) -> bool:

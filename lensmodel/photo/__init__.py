@@ -5,7 +5,6 @@ from lensmodel.photo.development import develop, inspect
 from lensmodel.photo.values import (
     ColorSpace,
     Encoding,
-    FileKind,
     LensIdentity,
     Limits,
     LinearPhoto,
@@ -19,7 +18,6 @@ __all__ = [
     "HEAD_BYTES",
     "ColorSpace",
     "Encoding",
-    "FileKind",
     "LensIdentity",
     "Limits",
     "LinearPhoto",

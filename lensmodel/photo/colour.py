@@ -149,11 +149,7 @@ def linear_profile(to_xyz_d50: Matrix) -> bytes:
 
 
 def camera_to_srgb(xyz_to_camera: Matrix) -> Matrix | None:
-    """White-balanced camera RGB to linear sRGB.
-
-    The rows of (XYZ -> camera)(sRGB -> XYZ) are scaled so that white stays white, then
-    inverted: D. Coffin's dcraw, function cam_xyz_coeff.
-    """
+    """White-balanced camera RGB to linear sRGB, white staying white: D. Coffin's dcraw, cam_xyz_coeff."""
     srgb_to_camera = xyz_to_camera[:3] @ SRGB_TO_XYZ_D65
     sums = srgb_to_camera.sum(axis=1, keepdims=True)
     if not np.isfinite(srgb_to_camera).all() or np.abs(sums).min() < 1e-6:

@@ -75,19 +75,17 @@ class Tag:
         """Bytes that the value claims to have."""
         return self.count * _SIZES[self.kind]
 
-    def raw(self) -> bytes:
-        """Bytes of the value; empty if it lies outside the buffer or is too large."""
-        end = self.offset + self.size
-        sound = self.offset >= 0 and self.size <= MAX_VALUE_BYTES and end <= len(self.buffer)
-        return bytes(self.buffer[self.offset : end]) if sound else b""
-
 
 class Tags(dict[int, Tag]):
     """The tags of a directory; one that is not there gives an empty value, or `None`."""
 
     def raw(self, tag: int) -> bytes:
-        """Bytes of a value."""
-        return self[tag].raw() if tag in self else b""
+        """Bytes of a value; empty if it lies outside the buffer or is too large."""
+        entry = self.get(tag)
+        if entry is None or entry.offset < 0 or entry.size > MAX_VALUE_BYTES:
+            return b""
+        end = entry.offset + entry.size
+        return bytes(entry.buffer[entry.offset : end]) if end <= len(entry.buffer) else b""
 
     def numbers(self, tag: int, most: int = MAX_VALUE_BYTES) -> tuple[float, ...]:
         """The first `most` values as numbers: rationals as quotients, NaN over zero; text gives none."""
@@ -275,9 +273,8 @@ def check_size(width: int, height: int, file_bytes: int, limits: Limits) -> None
     """Refuse what would be too large to decode."""
     megapixels = width * height / 1e6
     if megapixels > BOMB_MEGAPIXELS and width * height > BOMB_PIXELS_PER_BYTE * max(file_bytes, 1):
-        raise errors.DecompressionBombError(
-            f"{file_bytes} bytes claim to be {width} x {height} pixels; no photograph is packed like that"
-        )
+        said = f"{file_bytes} bytes claim to be {width} x {height} pixels; no photograph is packed like that"
+        raise errors.DecompressionBombError(said)
     if megapixels > limits.max_megapixels:
         most = f"the limit is {limits.max_megapixels:g} MP, scale or crop it"
         raise errors.ImageTooLargeError(f"{width} x {height} pixels are {megapixels:.0f} MP; {most}")
@@ -306,6 +303,7 @@ _KINDS: Final[tuple[tuple[int, bytes, str], ...]] = (
 )  # fmt: skip
 _READABLE: Final = "give RAW, DNG, TIFF, PNG or JPEG"
 COPY_AGAIN: Final = "copy it again from the camera or card"
+_SAVE_ANEW: Final = "save it anew from the original"
 
 
 def sniff(head: bytes) -> FileKind:
@@ -357,10 +355,8 @@ class JpegSegments(io.BytesIO):
         data = super().read(size)
         self.reads += self.in_header
         if self.reads > _MAX_READS:
-            raise errors.NotAnImageError(
-                f"the JPEG's header does not end within {_MAX_READS // 4} segments, or "
-                f"{_MAX_READS} stray bytes; save it anew from the original"
-            )
+            said = f"the JPEG's header does not end within {_MAX_READS // 4} segments"
+            raise errors.NotAnImageError(f"{said}; {_SAVE_ANEW}")
         if not (self.in_header and data.startswith(b"Exif\0")):
             return data
         self.exif.append(data)
@@ -381,13 +377,14 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
         image = opened_jpeg(segments)
     except (OSError, SyntaxError, ValueError) as error:
         if segments.tell() < len(segments.getbuffer()):
-            raise errors.NotAnImageError(
-                f"the JPEG has no frame header, or none of 8 bits ({error}); save it anew from the original"
-            ) from error
+            said = f"the JPEG has no frame header, or none of 8 bits ({error})"
+            raise errors.NotAnImageError(f"{said}; {_SAVE_ANEW}") from error
         raise errors.TruncatedImageError(f"the JPEG ends inside its header; {COPY_AGAIN}") from error
     # Pillow drops a profile whose parts say to be more, or fewer; the byte behind the word is their number
     parts = dict.fromkeys(data for _, data in image.applist if data.startswith(b"ICC_PROFILE\0"))
     profile = b"".join(part[14:] for part in sorted(parts, key=lambda part: part[12:13]))
+    luma, chroma = (2 * (image.layer or [(0, 1, 1, 0)]))[:2]  # grey is its own chroma
+    step = luma[2] // max(chroma[2], 1), luma[1] // max(chroma[1], 1)
     whole = buffer.find(_END_OF_IMAGE, segments.tell()) >= 0  # in a scan a zero follows each byte of 0xFF
     return Header(
         "jpeg",
@@ -398,18 +395,9 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
         icc=profile if parts else None,
         # cameras give the first table to luma
         coarseness=float(statistics.median(image.quantization.get(0, [0]))),
-        chroma_step=_chroma_step(image.layer),
+        chroma_step=step if {*step} <= {1, 2, 4} else (1, 1),
         whole=whole,
     )
-
-
-def _chroma_step(layers: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]:
-    """Rows and columns of pixels that share a value of chroma: luma's sampling factors over chroma's."""
-    if len(layers) < 3:
-        return 1, 1  # grey
-    (_, cols, rows, _), (_, chroma_cols, chroma_rows, _) = layers[:2]
-    step = rows // max(chroma_rows, 1), cols // max(chroma_cols, 1)
-    return step if {*step} <= {1, 2, 4} else (1, 1)
 
 
 # --- PNG ---------------------------------------------------------------------------------------
@@ -453,10 +441,8 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     known = _OF_SRGB if b"sRGB" not in found else {b"cICP"}  # sRGB goes before gAMA and cHRM
     other = b", ".join(name for name in known if found.get(name, _OF_SRGB[name]) != _OF_SRGB[name])
     if (other and not icc) or found.get(b"cICP", b"")[1:2] in _HDR:
-        raise errors.UnsupportedFormatError(
-            f"the PNG's {other.decode()} declares colours other than sRGB; convert it to sRGB, or save it "
-            "with an ICC profile"
-        )
+        said = f"the PNG's {other.decode()} declares colours other than sRGB"
+        raise errors.UnsupportedFormatError(f"{said}; convert it to sRGB, or save it with an ICC profile")
     return Header(
         "png",
         width,
@@ -543,7 +529,10 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
     )
     check_size(header.width, header.height, len(buffer), limits)
     if kind != "tiff":
-        _check_mosaic(photo)
+        # LibRaw would take an array that no demosaicing here is made for, for another
+        if 33422 in photo and len(shape := photo.integers(33421, 2)) == 2:
+            letters = "".join(_FILTERS[n : n + 1] or "?" for n in photo.raw(33422)[:256])
+            require_known_mosaic([letters[k * shape[1] : (k + 1) * shape[1]] for k in range(shape[0])])
         if header.compression == LOSSY_DNG and starts and lengths:
             tile = buffer[starts[0] : starts[0] + min(lengths[0], MAX_BLOCK_BYTES)]  # the first for all
             with contextlib.suppress(errors.NotAnImageError, errors.TruncatedImageError):
@@ -553,9 +542,7 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
         said = f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo"
         raise errors.UnsupportedFormatError(said)
     if not _pixels(photo) or not all(photo.keys() & either for either in _STRIPS):
-        raise errors.NotAnImageError(
-            f"the TIFF gives no size ({header.width} x {header.height}) or no strips: it holds no picture"
-        )
+        raise errors.NotAnImageError("the TIFF gives no size or no strips: it holds no picture")
     _check_numbers(photo)
     stored = _pixels(photo) * header.channels * photo.integer(258, 1) / 8
     missing = header.compression == 1 and sum(lengths) < 0.999 * stored
@@ -581,14 +568,6 @@ def require_known_mosaic(rows: Sequence[str]) -> None:
             f"the colours of the sensor repeat every {height} x {width} pixels ({' '.join(rows)}); only "
             "2 x 2 Bayer mosaics and X-Trans are read: have the camera or a raw converter bin or develop it"
         )
-
-
-def _check_mosaic(tags: Tags) -> None:
-    """Refuse a colour filter array that no demosaicing here is made for: LibRaw would take it for another."""
-    if 33422 in tags and len(shape := tags.integers(33421, 2)) == 2:
-        filters = tags.raw(33422)[:256]
-        letters = "".join(_FILTERS[number] if number < len(_FILTERS) else "?" for number in filters)
-        require_known_mosaic([letters[k * shape[1] : (k + 1) * shape[1]] for k in range(shape[0])])
 
 
 def _check_numbers(tags: Tags) -> None:

@@ -11,32 +11,21 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Final
 
 import imagecodecs
 import numpy as np
 import rawpy
 import tifffile
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lensmodel.core import errors
 from lensmodel.core.types import CHANNELS, Frame, LensSettings, NoiseModel, Planes
-from lensmodel.photo import colour, containers
+from lensmodel.photo import colour, containers, values
 from lensmodel.photo.containers import COPY_AGAIN
 from lensmodel.photo.metadata import Said
-from lensmodel.photo.sensor import Mosaic, coding_noise, estimate_noise, graininess
-from lensmodel.photo.values import (
-    Encoding,
-    LensIdentity,
-    Limits,
-    LinearPhoto,
-    PhotoInfo,
-    PhotoMetadata,
-    PlaneNoise,
-    Transfer,
-    remarks_log,
-)
-from lensmodel.photo.writing import OPCODES_2, OPCODES_3, opcodes_of_planes
+from lensmodel.photo.sensor import Mosaic, coding_noise, estimate_noise, graininess, replace_defects
+from lensmodel.photo.writing import OPCODES_2, OPCODES_3, Pixels, opcodes_of_planes
 
 MIN_SIDE = 16  # smaller pictures are icons, not photos
 
@@ -44,14 +33,14 @@ MIN_SIDE = 16  # smaller pictures are icons, not photos
 _UNDECODED: Final = {9: "VC-5 (GoPro GPR)", 52546: "JPEG XL"}
 
 
-def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
+def inspect(path: Path | str, limits: values.Limits | None = None) -> values.PhotoInfo:
     """Read kind, size and metadata from the header, and refuse what cannot be developed."""
-    with _opened(Path(path), limits or Limits()) as (_, _, info):
+    with _opened(Path(path), limits or values.Limits()) as (_, _, info):
         return info
 
 
 @contextlib.contextmanager
-def _opened(path: Path, limits: Limits) -> Iterator[tuple[Said, rawpy.RawPy | None, PhotoInfo]]:
+def _opened(path: Path, limits: values.Limits) -> Iterator[tuple[Said, rawpy.RawPy | None, values.PhotoInfo]]:
     """Open a file once: what its header says, LibRaw where it is a RAW file, and both together."""
     with contextlib.ExitStack() as stack:
         said = Said.of(stack.enter_context(containers.opened_header(path, limits)))
@@ -76,12 +65,15 @@ def _opened(path: Path, limits: Limits) -> Iterator[tuple[Said, rawpy.RawPy | No
         # no camera stores a picture higher than wide and says that it lies
         upright = raw is None and height > width and metadata.orientation == 1
         turned = upright and metadata.camera_model is not None
-        yield said, raw, PhotoInfo(header.kind, width, height, metadata, said.is_centred, turned)
+        yield said, raw, values.PhotoInfo(header.kind, width, height, metadata, said.is_centred, turned)
 
 
 def develop(
-    path: Path | str, *, limits: Limits | None = None, on_info: Callable[[PhotoInfo], None] | None = None
-) -> LinearPhoto:
+    path: Path | str,
+    *,
+    limits: values.Limits | None = None,
+    on_info: Callable[[values.PhotoInfo], None] | None = None,
+) -> values.LinearPhoto:
     """Develop a photo: RAW through LibRaw, TIFF, PNG and JPEG through their transfer curve.
 
     RAW is in camera colors before white balance, others in the primaries of their profile. Curves are those
@@ -113,7 +105,7 @@ def develop(
         If it is larger than the limits allow.
     """
     path = Path(path)
-    with _opened(path, limits or Limits()) as (said, raw, info):
+    with _opened(path, limits or values.Limits()) as (said, raw, info):
         try:
             if on_info is not None:
                 on_info(info)
@@ -123,7 +115,7 @@ def develop(
             raise
         developed = _develop_raster(path, said, info) if raw is None else _develop_raw(raw, said, info)
     for remark in developed.remarks:
-        remarks_log.warning("%s: %s", path.name, remark)
+        values.remarks_log.warning("%s: %s", path.name, remark)
     return developed
 
 
@@ -136,7 +128,7 @@ def photo_from_array(
     focal_mm: float | None = None,
     focus_m: float | None = None,
     pixel_pitch_um: float | None = None,
-) -> LinearPhoto:
+) -> values.LinearPhoto:
     """Make a developed photo of an array.
 
     Parameters
@@ -175,17 +167,17 @@ def photo_from_array(
     models = tuple(estimate_noise(plane, clip) for plane in array) if given is None else tuple(given)
     if len(models) != len(CHANNELS):
         raise errors.InvalidInputError(f"noise needs one model, or one for each plane, got {len(models)}")
-    metadata = PhotoMetadata(
+    metadata = values.PhotoMetadata(
         aperture=aperture, focal_mm=focal_mm, focus_m=focus_m, pixel_pitch_um=pixel_pitch_um
     )
     frame = Frame(*array.shape[1:])
-    return LinearPhoto(
+    return values.LinearPhoto(
         planes=array,
         frame=frame,
         noise=models,
         clip=(clip,) * 3,
-        info=PhotoInfo("tiff", frame.width, frame.height, metadata),
-        encoding=Encoding(bit_depth=32, transfer="linear", metadata=metadata),
+        info=values.PhotoInfo("tiff", frame.width, frame.height, metadata),
+        encoding=values.Encoding(bit_depth=32, transfer="linear", metadata=metadata),
     )
 
 
@@ -228,12 +220,11 @@ def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
         raise errors.RawDecodeError(said) from error
 
 
-def _exposure_of(raw: rawpy.RawPy, camera: PhotoMetadata) -> PhotoMetadata:
+def _exposure_of(raw: rawpy.RawPy, camera: values.PhotoMetadata) -> values.PhotoMetadata:
     """What LibRaw knows of a photo whose header names the camera alone; 0 is its word for unknown."""
     said = raw.other
     return replace(
         camera,
-        lens=LensIdentity(model=raw.lens.model or None),
         aperture=round(said.aperture, 1) or None,
         focal_mm=said.focal_length or None,
         iso=said.iso_speed or None,
@@ -245,11 +236,8 @@ def _exposure_of(raw: rawpy.RawPy, camera: PhotoMetadata) -> PhotoMetadata:
     )
 
 
-def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
-    """Develop an open RAW file to linear camera RGB, once its defective pixels are replaced.
-
-    No white balance, no colour matrix, no rotation: 1.0 is the level at which the sensor saturates.
-    """
+def _develop_raw(raw: rawpy.RawPy, said: Said, info: values.PhotoInfo) -> values.LinearPhoto:
+    """Develop an open RAW file to linear camera RGB, once its defective pixels are replaced."""
     tags, mosaic, white, clip = said.tags, Mosaic.of(raw), int(raw.white_level), (1.0, 1.0, 1.0)
     # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing, and stretches them
     lossy = said.header.compression == containers.LOSSY_DNG
@@ -262,7 +250,7 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
         opcodes, lost = opcodes_of_planes(opcodes, cfa)
         if lost:
             remarks.append(f"what its OpcodeList2 asks of the mosaic alone is dropped ({lost})")
-        if count := mosaic.repair():
+        if count := replace_defects(mosaic.values, mosaic.colours, mosaic.period):  # in LibRaw's own memory
             many = " of its sensor is" if count == 1 else "s of its sensor are"
             remarks.append(f"{count} defective pixel{many} replaced")
     balance, own_balance = _white_balance(raw)
@@ -272,13 +260,13 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
     _, height, width = planes.shape
     noise = _plane_noise(planes, sensor_noise, balance)
     to_srgb, xyz_to_camera = _colour(raw, balance)
-    return LinearPhoto(
+    return values.LinearPhoto(
         planes=planes,
         frame=Frame(height, width),
         noise=noise,
         clip=clip,
         info=replace(info, width=width, height=height),
-        encoding=Encoding(
+        encoding=values.Encoding(
             bit_depth=max(1, white.bit_length()),
             metadata=info.metadata.without_serials(),
             white_balance=balance,
@@ -299,17 +287,14 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
 def _developed(
     raw: rawpy.RawPy, white: int, balance: tuple[float, float, float], stated: tuple[int, ...]
 ) -> Planes:
-    """Demosaic with white balance, then take the balance off again.
-
-    Demosaicing fills in the fine detail of red and blue from green as if their contrasts were equal, as they
-    roughly are after white balance only. `stated` is the white that a DNG without a mosaic states: LibRaw
-    takes the black of such files off their values, but not off their white.
-    """
+    """Demosaic with white balance, then take the balance off again; white becomes 1.0."""
+    # Demosaicing fills in the fine detail of red and blue from green as if their contrasts were equal, as
+    # they roughly are after white balance only.
     share = np.maximum(np.asarray(balance) / max(balance), _LEAST_SHARE)
     full, colours = share, min(raw.num_colors, 3)
     # LibRaw applies this after it took the black level off, so it counts from black.
     saturation = None if white == raw.white_level else white - min(raw.black_level_per_channel)
-    if stated:
+    if stated:  # by a DNG without a mosaic: LibRaw takes its black off the values, but not off the white
         black = np.array(raw.black_level_per_channel[:colours], dtype=float)
         spans = np.resize(np.resize(stated, colours) - black, 3)
         if spans.min() > 0.0:
@@ -344,8 +329,8 @@ def _developed(
 
 
 def _plane_noise(
-    planes: Planes, sensor: PlaneNoise | None, balance: tuple[float, float, float]
-) -> PlaneNoise:
+    planes: Planes, sensor: values.PlaneNoise | None, balance: tuple[float, float, float]
+) -> values.PlaneNoise:
     """Variance of each plane's pixels, from that of the sensor where it is known.
 
     Demosaicing adds detail of colour s, noise included, to plane c after white balance w::
@@ -362,10 +347,7 @@ def _plane_noise(
 
 
 def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], bool]:
-    """Multipliers of r, g, b, that of green 1, and whether they are the camera's own.
-
-    Where it wrote none, LibRaw makes what is not saturated grey on average; of the dark, daylight's serve.
-    """
+    """Multipliers of r, g, b, that of green 1, and whether they are the camera's own."""
 
     def balanced(r: float, g: float, b: float, *_: float) -> tuple[float, float, float] | None:
         usable = min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20  # others are absurd
@@ -373,6 +355,7 @@ def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], bool]:
 
     if own := balanced(*raw.camera_whitebalance):
         return own, True
+    # what is not saturated becomes grey on average; of the dark, daylight's serve
     raw.postprocess(use_auto_wb=True, half_size=True, output_bps=8)
     of_the_picture = balanced(*(raw.auto_whitebalance or (0.0, 0.0, 0.0)))
     return of_the_picture or balanced(*raw.daylight_whitebalance) or (1.0, 1.0, 1.0), False
@@ -394,40 +377,34 @@ def _colour(
 
 # --- TIFF, PNG and JPEG ------------------------------------------------------------------------
 
-Pixels: TypeAlias = NDArray[Any]
-"""Numbers of a file, `(row, col)` or `(row, col, channel)`."""
 
-_TURNED: Final = (
-    "a program has turned its pixels upright, and nothing tells which way: the PSFs of both are averaged, "
-    "and the more these differ, the less is corrected"
-)
-
-
-def _develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
+def _develop_raster(path: Path, said: Said, info: values.PhotoInfo) -> values.LinearPhoto:
     """Decode a picture and turn its numbers into linear light by its transfer curve."""
     header, pixels = said.header, _read_pixels(path, said.header)
     height, width = pixels.shape[:2]
     if (height, width) != (info.height, info.width):
-        raise errors.UnreadablePhotoError(
-            f"the header says {info.width} x {info.height}, the decoder gave {width} x {height}; save it anew"
-        )
+        said_so = f"the header says {info.width} x {info.height}, the decoder gave {width} x {height}"
+        raise errors.UnreadablePhotoError(f"{said_so}; save it anew")
     floating, depth, remarks = pixels.dtype.kind == "f", pixels.dtype.itemsize, list[str]()
     transfer, icc = _transfer_of(said, floating, remarks)
     if info.turned:
-        remarks.append(_TURNED)
+        said_so = "a program has turned its pixels upright, and nothing tells which way"
+        remarks.append(f"{said_so}: the more the PSFs of both differ, the less is corrected")
     curves = colour.curves_of(transfer, icc)
-    planes: Planes = np.stack([colour.decode(pixels[:, :, k], curve) for k, curve in enumerate(curves)])
+    planes: Planes = np.empty((3, height, width), dtype=np.float32)
+    for k, curve in enumerate(curves):
+        planes[k] = colour.decode(pixels[:, :, k], curve)
     green, code = curves[1], colour.CODES // 255 if depth == 1 else 1
     clip = (max(1.0, float(planes.max())) if floating else 1.0,) * 3
     codes, step = green[::code] if depth == 1 else None, float(green[code] - green[0])
     noise = tuple(estimate_noise(plane, clip[0], step, codes) for plane in planes)
-    return LinearPhoto(
+    return values.LinearPhoto(
         planes=planes,
         frame=Frame(height, width),
         noise=noise,
         clip=clip,
         info=info,
-        encoding=Encoding(8 * depth, transfer, icc, info.metadata.without_serials()),
+        encoding=values.Encoding(8 * depth, transfer, icc, info.metadata.without_serials()),
         grain=tuple(map(graininess, planes, noise, clip)),
         coding_noise=coding_noise(header.coarseness, green),
         chroma_step=header.chroma_step,
@@ -435,7 +412,7 @@ def _develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
     )
 
 
-def _transfer_of(said: Said, floating: bool, remarks: list[str]) -> tuple[Transfer, bytes | None]:
+def _transfer_of(said: Said, floating: bool, remarks: list[str]) -> tuple[values.Transfer, bytes | None]:
     """Which curve the numbers follow, and the profile for the output; one that is left out is remarked on."""
     icc = said.header.icc
     if colour.read_profile(icc) is not None:

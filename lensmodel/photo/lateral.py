@@ -63,11 +63,10 @@ class LateralColour:
 
 
 def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[float] = 1.0) -> LateralColour:
-    """Estimate lateral colour from corners and edges of the photo.
+    """Estimate lateral colour from corners of the photo, by cross-correlation of band-passed windows.
 
-    Around points of green with structure in both directions the shift of red and blue is where the
-    normalised cross-correlation of band-passed windows peaks. The radial part of the shifts is fitted by
-    Huber-weighted least squares; the Bayesian information criterion chooses the number of terms, or none.
+    The radial part of the shifts is fitted by Huber-weighted least squares; the Bayesian information
+    criterion chooses the number of terms, or none.
     """
     full, half = 0.98 * np.broadcast_to(clip, 3), _WINDOW // 2 + _SEARCH  # with a margin for the band-pass
     found: dict[int, list[tuple[float, float]]] = {0: [], 2: []}  # radius and outward shift of red and blue
@@ -86,10 +85,7 @@ def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[flo
 
 
 def resample(planes: Planes, frame: Frame, lateral: LateralColour) -> Planes:
-    """Move red and blue onto green by one interpolation with cubic B-splines.
-
-    Interpolation softens a little; `correct_planes(..., lateral=...)` needs none.
-    """
+    """Move red and blue onto green by one interpolation with cubic B-splines, which softens a little."""
     out = np.array(planes, dtype=np.float32)
     row_c, col_c = frame.center
     cols = np.arange(frame.width) - col_c

@@ -3,15 +3,15 @@
 The order of trust is EXIF, maker note, XMP. The place where a photo was taken is overwritten where it stands,
 in TIFF structures wherever they lie and in XMP that is not compressed: no length changes.
 
-Sources: CIPA DC-008-2023 (Exif 3.0), section 4.6; ISO 16684-1:2019, sections 7 and 8 (XMP); Adobe, "XMP
-Specification Part 2", 2016 (`aux`); CIPA DC-010-2024 (`exif`, `exifEX`, `tiff`); "Portable Network Graphics,
-third edition", W3C, 2025, sections 5 and 11; for maker notes, which no maker documents, ExifTool's tag
-tables (P. Harvey), checked against files of these cameras.
+Sources: CIPA DC-008-2023 (Exif 3.0), section 4.6; ISO 16684-1:2019 (XMP); Adobe, "XMP Specification Part 2",
+2016 (`aux`); CIPA DC-010-2024 (`exif`, `exifEX`, `tiff`); for maker notes, which no maker documents,
+ExifTool's tag tables (P. Harvey), checked against files of these cameras.
 """
 
 from __future__ import annotations
 
 import contextlib
+import html
 import math
 import re
 import struct
@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
-from typing import Final, TypeAlias
-from xml.sax.saxutils import quoteattr, unescape
+from typing import Final
+from xml.sax.saxutils import quoteattr
 
 from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo import containers
@@ -156,12 +156,8 @@ class Said:
     def _placed(self) -> tuple[float | None, bool]:
         """Pitch of the pixels in micrometres, and whether they are all of the sensor or its middle.
 
-        The pitch is from the focal plane resolution, else from the focal length for 35 mm film: its frame is
-        as many times larger as that is longer. Programs that scale a photo down rarely correct the former;
-        then width times pitch is the width of no common sensor, and it says nothing. A mosaic was never
-        scaled, only cut.
-
-        Source: CIPA DC-008-2023, tags FocalPlaneXResolution and FocalLengthIn35mmFilm.
+        Programs that scale a photo down rarely correct the focal plane resolution; then width times pitch is
+        the width of no common sensor, and the focal length for 35 mm film tells. A mosaic is only ever cut.
         """
         number, header = self.tags.number, self.header
         zoom = _first_within(1.0, 20.0, number(0xA404)) or 1.0  # of the middle, enlarged: DigitalZoomRatio
@@ -169,6 +165,7 @@ class Said:
         crop = _first_within(*_CROP_FACTORS, of_film / focal if focal and of_film else None)
         frame_px = max(math.hypot(header.width, header.height), 1.0)
         film = crop and _first_within(*_PITCHES_UM, 1000.0 * _FILM_DIAGONAL_MM / crop / frame_px)
+        # FocalLengthIn35mmFilm above, FocalPlaneXResolution below: CIPA DC-008-2023
         per_unit, unit = number(0xA20E), number(0xA210) or 2.0
         unit_um = {2.0: 25400.0, 3.0: 10000.0, 4.0: 1000.0, 5.0: 1.0}.get(unit, 0.0)
         plane = _first_within(*_PITCHES_UM, unit_um / per_unit if per_unit else None)
@@ -280,12 +277,11 @@ def read_xmp(packet: bytes | None) -> Mapping[str, str]:
     properties = dict[str, str]()
     if packet and len(packet) <= MAX_XMP_BYTES and b"<!DOCTYPE" not in packet:
         for match in _PROPERTY.finditer(packet):
-            if value := unescape(match[match.lastindex or 0].decode("utf-8", "replace"), _QUOTES).strip():
+            if value := html.unescape(match[match.lastindex or 0].decode("utf-8", "replace")).strip():
                 properties.setdefault(match[1].decode(), value)
     return properties
 
 
-_QUOTES: Final = {"&quot;": '"', "&apos;": "'"}
 _PACKET: Final = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
 <rdf:Description rdf:about="" xmlns:aux="http://ns.adobe.com/exif/1.0/aux/"
@@ -366,17 +362,13 @@ _PACKED: Final = re.compile(rb"Raw profile type |XML:com\.adobe\.xmp\x00\x01")
 _HIDDEN: Final = b"prVt"  # type of a chunk that every reader skips: ancillary, private, safe to copy
 
 
-Overwrite: TypeAlias = tuple[int, bytes]
-"""A place, and bytes to be written there over others of the same number."""
-
-
-def find_location(buffer: Buffer) -> tuple[list[Overwrite], bool]:
-    """Find what removes the place where a photo was taken, and whether all of the file was looked at.
+def find_location(buffer: Buffer) -> tuple[list[tuple[int, bytes]], bool]:
+    """Find where to write which bytes to remove the place of a photo, and whether all of the file was seen.
 
     Not found: names of places in IPTC blocks and maker notes, and anything inside compressed blocks other
     than those of PNG.
     """
-    spans, chunks = list[Overwrite](), list[tuple[bytes, int, int]]()
+    spans, chunks = list[tuple[int, bytes]](), list[tuple[bytes, int, int]]()
     if buffer[:4] == b"\x89PNG":
         with contextlib.suppress(TruncatedImageError):
             chunks.extend(containers.png_chunks(buffer))
@@ -399,7 +391,7 @@ def find_location(buffer: Buffer) -> tuple[list[Overwrite], bool]:
     return _with_checksums(buffer, chunks, spans), complete
 
 
-def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[Overwrite]:
+def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[tuple[int, bytes]]:
     """Yield what empties a GPS directory: its values that lie elsewhere, then its tags."""
     tags, _ = reader.directory(offset)
     start = reader.base + offset
@@ -408,15 +400,15 @@ def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[Over
     end = start + 2 + count * containers.ENTRY
     if not 0 < count <= MAX_TAGS or end > len(buffer):
         return
-    for entry in tags.values():
-        if not start <= entry.offset < end and 0 < entry.size <= MAX_VALUE and entry.raw():
+    for number, entry in tags.items():
+        if not start <= entry.offset < end and 0 < entry.size <= MAX_VALUE and tags.raw(number):
             yield entry.offset, bytes(entry.size)
     yield start, bytes(end - start)
 
 
 def _with_checksums(
-    buffer: Buffer, chunks: Iterable[tuple[bytes, int, int]], spans: list[Overwrite]
-) -> list[Overwrite]:
+    buffer: Buffer, chunks: Iterable[tuple[bytes, int, int]], spans: list[tuple[int, bytes]]
+) -> list[tuple[int, bytes]]:
     """Renew the checksums of a PNG's chunks that change; hide those whose metadata cannot be searched."""
     renewed = list(spans)
     for name, start, length in chunks:

@@ -43,13 +43,9 @@ def estimate_noise(
 ) -> NoiseModel:
     """Fit var(y) = shot * y + read to the flat places of a plane of linear light whose noise is white.
 
-    Of each level the blocks with the least texture count, those near `clip` or black not. Texture is judged
-    on the low-passed plane and noise on the high-passed one, so that the choice does not favour blocks whose
-    noise happens to be small. A variance is no less than what rounding makes: by the smallest `step` between
-    the file's numbers near black, or by the light of each of its `codes` of 8 bits.
-
-    Source: A. Foi, M. Trimeche, V. Katkovnik, K. Egiazarian, "Practical Poissonian-Gaussian noise modeling
-    and fitting for single-image raw-data", IEEE TIP 17, 2008.
+    A variance is no less than what rounding makes: by the smallest `step` between the file's numbers near
+    black, or by the light of each of its `codes` of 8 bits. A. Foi, M. Trimeche, V. Katkovnik, K. Egiazarian,
+    "Practical Poissonian-Gaussian noise modeling and fitting for single-image raw-data", IEEE TIP 17, 2008.
     """
     levels, variances, counts = _levels(_sampled(np.asarray(plane, dtype=np.float32)), clip).T
     if codes is not None and len(levels):
@@ -61,13 +57,10 @@ def estimate_noise(
 
 
 def coding_noise(coarseness: float, curve: NDArray[np.floating]) -> NoiseModel | None:
-    """Noise that a JPEG's rounding of cosine coefficients makes where detail is: step^2 / 12 in each.
-
-    The middle one of the steps, `coarseness`, speaks for all: the coarsest are those of frequencies of which
-    a lens leaves little. `curve` is the light of the codes of 16 bits.
-    """
+    """Noise that a JPEG's rounding of cosine coefficients makes where detail is: step^2 / 12 in each."""
     if not coarseness:
         return None
+    # the middle step speaks for all: the coarsest are those of frequencies of which a lens leaves little
     codes = curve[::257]
     levels, widths = codes[1:-1].astype(np.float64), np.gradient(codes)[1:-1]
     variances = np.maximum((coarseness * widths) ** 2 / 12.0, 1e-16)
@@ -101,7 +94,11 @@ def _sampled(plane: Plane) -> Plane:
 
 
 def _levels(plane: Plane, clip: float) -> NDArray[np.float64]:
-    """Mean, variance and number of pixels of each level that was seen flat, shape (n, 3)."""
+    """Mean, variance and number of pixels of each level that was seen flat, shape (n, 3).
+
+    Texture is judged on the low-passed plane and noise on the high-passed one, so that the choice does not
+    favour blocks whose noise happens to be small.
+    """
     if min(plane.shape) < 3 * BLOCK:
         return np.zeros((0, 3))
     low = ndimage.gaussian_filter(plane, 2.0, mode="nearest", truncate=3.0)
@@ -124,9 +121,9 @@ def _levels(plane: Plane, clip: float) -> NDArray[np.float64]:
 def _scale(values: NDArray[np.float32]) -> float:
     """Robust standard deviation: the s for which the mean of min(v^2, (1.5 s)^2) is that of a normal v.
 
-    A median of a camera's 8-bit differences jumps by a factor of 2 where the noise is half a step.
     P. J. Huber, "Robust estimation of a location parameter", Ann. Math. Stat. 35, 1964, proposal 2.
     """
+    # a median of a camera's 8-bit differences jumps by a factor of 2 where the noise is half a step
     power = np.square(values, dtype=np.float32).ravel()
     sigma = _MAD_TO_SIGMA * float(np.sqrt(np.median(power)))
     for _ in range(20):
@@ -146,13 +143,10 @@ def _blocks(plane: NDArray[np.float32]) -> NDArray[np.float32]:
 def _line(
     levels: NDArray[np.float64], variances: NDArray[np.float64], counts: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Slope and offset of a line through the levels, robust against those where no place is flat.
-
-    The error of a variance is proportional to the variance, so the weights are count / var^2;
-    texture only ever adds, so points above the line lose weight, those below do not.
-    """
-    # Three standard errors of a variance from the median deviation of pixels, every second of
-    # which is independent after the high-pass.
+    """Slope and offset of a line through the levels, robust against those where no place is flat."""
+    # The error of a variance is proportional to the variance, so the weights are count / var^2; texture only
+    # ever adds, so points above the line lose weight, those below do not. `chance` is three standard errors
+    # of a variance from the median deviation of pixels, every second independent after the high-pass.
     chance = 3.0 * np.sqrt(2.7 * 2.0 * 2.0 / counts)
     trust, model = np.ones_like(levels), np.maximum(variances, 1e-16)
     slope = offset = 0.0
@@ -196,29 +190,23 @@ class Mosaic:
         mosaic = cls(values, raw.raw_colors_visible, black, int(raw.white_level), len(raw.raw_pattern))
         height, width = values.shape
         if mosaic.period == 6 and min(height, width) < _XTRANS_SIDE:
-            raise UnsupportedFormatError(
-                f"{width} x {height} pixels of an X-Trans mosaic are too few to be demosaiced: give the "
-                f"whole frame, at least {_XTRANS_SIDE} pixels high"
-            )
+            said = f"{width} x {height} pixels of an X-Trans mosaic are too few to be demosaiced"
+            raise UnsupportedFormatError(f"{said}: give the whole frame")
         low, high = values.min(axis=1), values.max(axis=1)
         if low.min() == high.max():
             raise RawDecodeError(f"every pixel of the RAW data is {int(low[0])}; the file holds no picture")
         # A row in which all is saturated is a bright sky, and no damage.
         dead = float(np.mean((low == high) & (low < 0.9 * mosaic.white)))
         if dead > 0.02:
-            raise TruncatedImageError(
-                f"{dead:.0%} of the rows of the RAW data are empty; the file was cut off"
-            )
+            raise TruncatedImageError(f"{dead:.0%} of the rows of the RAW data are empty; it was cut off")
         if (random := mosaic._random_share()) > 0.25:
             said = "of the RAW data are random numbers; the file is damaged or wrongly decoded"
             raise RawDecodeError(f"{random:.0%} {said}")
         return mosaic
 
     def _random_share(self) -> float:
-        """Share of the bands of rows that have high contrast, but no likeness of neighbouring pixels.
-
-        Independent values differ by 2 / sqrt(pi) = 1.13 standard deviations on average, photographs by 0.5.
-        """
+        """Share of the bands of rows that have high contrast, but no likeness of neighbouring pixels."""
+        # independent values differ by 2 / sqrt(pi) = 1.13 standard deviations on average, photographs by 0.5
         starts = range(0, len(self.values), _BAND)
         scale, random = max(self.white - min(self.black), 1.0), 0
         for row in starts:
@@ -232,15 +220,9 @@ class Mosaic:
             random += deviation > 0.15 * scale and step > 0.9 * deviation
         return random / len(starts)
 
-    def repair(self) -> int:
-        """Replace defective pixels in LibRaw's own memory, before it demosaics; return how many."""
-        return replace_defects(self.values, self.colours, self.period)
-
     def saturation(self) -> tuple[int, tuple[float, float, float]]:
-        """Level at which the sensor clips, and that of each colour relative to it, where clipped pixels pile.
-
-        The level that a file states is often too high, and the colours of some sensors differ.
-        """
+        """Level at which the sensor clips, and that of each colour relative to it, where pixels pile up."""
+        # the level that a file states is often too high, and the colours of some sensors differ
         piles = {k: pile for k in range(4) if (pile := self._pile(k)) is not None}
         white = min(max((end for _, end in piles.values()), default=self.white), self.white)
         clip = [1.0, 1.0, 1.0, 1.0]
@@ -249,10 +231,8 @@ class Mosaic:
         return white, (clip[0], min(clip[1], clip[3]), clip[2])
 
     def _pile(self, colour: int) -> tuple[int, int] | None:
-        """Lower and upper end of the pile of saturated pixels of one colour; `None` without one.
-
-        Full wells differ from pixel to pixel, by a hundredth on old sensors; hot pixels shine beyond them.
-        """
+        """Lower and upper end of the pile of saturated pixels of one colour; `None` without one."""
+        # full wells differ from pixel to pixel, by a hundredth on old sensors; hot pixels shine beyond them
         counts = np.bincount(self.values[self.colours == colour])
         scale = self.white - self.black[colour]
         first = max(int(self.black[colour] + _LOWEST_PILE * scale), 0)
@@ -320,10 +300,7 @@ Places: TypeAlias = NDArray[np.int64]
 
 
 def replace_defects(values: NDArray[np.uint16], colours: NDArray[np.uint8], period: int) -> int:
-    """Replace pixels that stand alone by the median of the nearest sound ones of their colour; say how many.
-
-    `colours` are 0 red, 1 and 3 green, 2 blue, and repeat after `period` pixels, 2 or 6.
-    """
+    """Replace pixels that stand alone by the median of the nearest sound ones of their colour."""
     near = Neighbours(values, colours, period)
     places = defects(near)
     around = near.of(places)

@@ -94,9 +94,8 @@ class PhotoMetadata:
     def require_aperture(self, given: LensSettings | None = None) -> None:
         """Refuse a photo whose aperture neither the file nor the caller says."""
         if self.settings(given).aperture is None:
-            raise MetadataMissingError(
-                "it does not say its aperture; give its f-number by --aperture, 2.8 for f/2.8"
-            )
+            said = "it does not say its aperture; give its f-number by --aperture, 2.8 for f/2.8"
+            raise MetadataMissingError(said)
 
     def without_serials(self) -> PhotoMetadata:
         """Return the same without the serials of body and lens, which are personal data."""
@@ -117,10 +116,8 @@ class PhotoInfo:
     def require_known_turn(self) -> None:
         """Refuse to learn from a photo of which nobody can tell how it lay on the sensor."""
         if self.turned:
-            raise TurnedPixelsError(
-                "a program has turned its pixels upright, and nothing tells which way: no place of it is "
-                "known on the sensor; give the file as the camera wrote it"
-            )
+            said = "a program has turned its pixels upright, and nothing tells which way"
+            raise TurnedPixelsError(f"{said}; give the file as the camera wrote it")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,26 +146,19 @@ class LinearPhoto:
     ----------
     planes : ndarray of float32, shape (3, height, width)
         Black 0, saturation 1, not white balanced; RAW stays in the camera's own colors.
-    frame : Frame
-        Size of the planes.
-    noise, sensor_noise : tuple of three NoiseModel
-        Variance of the pixels of each plane, and, where there is a mosaic, that of the sensor itself: white,
-        unlike that of demosaiced planes, whose pixels share their neighbours' noise.
+    frame, info, encoding : Frame, PhotoInfo, Encoding
+        Size of the planes; what the file says; the way back to a file.
+    noise, sensor_noise, coding_noise : NoiseModel
+        Variance of the pixels of each plane; where there is a mosaic, that of the sensor itself in each
+        colour: white, unlike that of demosaiced planes; what lossy compression adds where there is detail.
     clip : tuple of three float
         Level of each plane at which the sensor, or the file, clips.
-    info : PhotoInfo
-        What the file says.
-    encoding : Encoding
-        The way back to a file.
-    coding_noise : NoiseModel or None
-        What lossy compression adds where there is detail; `None` where there was none.
     cfa : BayerPattern or None
         Which pixels of each plane were measured, and not filled in by demosaicing. `None` where
         the planes are no longer on the sensor's grid, or there was no Bayer mosaic.
-    grain : tuple of float
-        How much coarser than white the noise of each plane is: see `sensor.graininess`.
-    chroma_step : tuple of int
-        Rows and columns of pixels that share one value of chroma: (2, 2) in most JPEGs.
+    grain, chroma_step : tuple of three float, tuple of two int
+        How much coarser than white the noise of each plane is (`sensor.graininess`); rows and columns of
+        pixels that share one value of chroma: (2, 2) in most JPEGs.
     remarks : tuple of str
         What was left out of the file or replaced in it, each a clause about "it".
     """

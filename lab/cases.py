@@ -17,7 +17,7 @@ from scipy import signal
 
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
-from lensmodel.core.types import Frame, Kernel, NoiseModel, Plane, Planes
+from lensmodel.core.types import Kernel, NoiseModel, Plane, Planes
 from lensmodel.patches import Patch, select
 from lensmodel.simulate import DEMO_SCENES, demo_data_path, load_scene
 
@@ -157,7 +157,7 @@ def observe(case: BlindCase, kernel: Kernel) -> Observation:
     plane = (blurred + rng.normal(0.0, case.noise, blurred.shape)).astype(np.float32)
     noise, (height, width) = NoiseModel.white(case.noise), plane.shape
     try:
-        found = select(plane, noise, Frame(height, width), size=size)
+        found = select(plane, noise, size=size)
     except NoUsablePatchesError:  # the middle of the frame, lest a method profits from the refusal
         row, col = (height - size) // 2, (width - size) // 2
     else:

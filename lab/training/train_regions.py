@@ -26,7 +26,7 @@ from lab.blind.methods import BlindMethod, compared
 from lab.cases import list_photos, photo_half, scene_of
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.types import FieldPosition, Frame, LensSettings, NoiseModel, ignore_step
+from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, ignore_step
 from lensmodel.patches.select import FEATURES, RMapSelector, features_of, first_reasons
 from lensmodel.patches.windows import BLOCKS_A_SIDE, details_of, windows_of
 from lensmodel.simulate import draw_lens
@@ -64,8 +64,7 @@ def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[La
     blurred = signal.fftconvolve(scene_of(photo)[1].astype(np.float64), kernel, mode="valid")
     plane = (blurred + rng.normal(0.0, sigma, blurred.shape)).astype(np.float32)
     noise = NoiseModel.white(sigma)
-    frame = Frame(*plane.shape)
-    windows = windows_of(plane, frame, noise, SIZE // BLOCKS_A_SIDE, 1.0, ignore_step)
+    windows = windows_of(plane, noise, SIZE // BLOCKS_A_SIDE, 1.0, ignore_step)
     usable = np.flatnonzero(first_reasons(windows) == "")
     if usable.size < WINDOWS_A_GROUP:
         return

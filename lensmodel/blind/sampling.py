@@ -153,7 +153,6 @@ def find_patches(
     selection = select(
         developed.planes[1],
         developed.noise[1],
-        developed.frame,
         clip=developed.clip[1],
         count=count,
         size=size,

@@ -97,27 +97,15 @@ def calibrate(
                     shown.detail(f"{event.photo}: {event.total} samples")
                 results.append({"photo": str(event.photo), **result})
                 bar.show(len(results))
-    lens = calibration.known
-    coverage = {} if lens is None else lens.model.coverage()
-    photo_count = len(lens.photos) if lens else 0
-    failed = [result for result in results if result["state"] == "failed"]
-    shown.document(
-        {
-            "profile": str(profile) if lens else None,
-            "photos": photo_count,
-            "samples": len(lens.samples) if lens else 0,
-            "coverage": coverage,
-            "model": lens.model.mode if lens else None,
-            "results": results,
-        }
-    )
-    if lens is not None and len(failed) < len(results):
-        places = sum(coverage.values())
-        shown.result(f"{profile}: photos {photo_count}, blur measured at {places} places")
-    if lens is None:
-        shown.error(
-            "no photo could be used, so there is no profile; the lines above say what each photo needs"
-        )
+    lens, failed = calibration.known, sum(result["state"] == "failed" for result in results)
+    found: dict[str, Any] = {"profile": None, "photos": 0, "samples": 0, "coverage": {}, "model": None}
+    if lens is not None:
+        photo_count, coverage = len(lens.photos), lens.model.coverage()
+        found = {"profile": str(profile), "photos": photo_count, "samples": len(lens.samples)}
+        found |= {"coverage": coverage, "model": lens.model.mode}
+        if failed < len(results):
+            shown.result(f"{profile}: photos {photo_count}, blur measured at {sum(coverage.values())} places")
+    shown.document({**found, "results": results})
     if failed:
         raise typer.Exit(1)
 

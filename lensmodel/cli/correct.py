@@ -153,13 +153,10 @@ def targets_of(
         if file_format is not None and EXTENSION[FORMATS[named.suffix.lower()]] != extension:
             raise UsageError(f"{named.name} is no name for --format {file_format}; end it in {extension}")
         return {paths[0]: named}
-    targets = {}
-    for path in paths:
-        folder = path.parent / FOLDER if output is None else named
-        if folder.exists() and not folder.is_dir():
-            raise UsageError(f"{folder} is a file; give a folder to -o")
-        targets[path] = folder / f"{path.stem}{CORRECTED}{extension}"
-    return targets
+    if named.is_file():
+        raise UsageError(f"{named} is a file; give a folder to -o")
+    folders = {path: path.parent / FOLDER if output is None else named for path in paths}
+    return {path: folder / f"{path.stem}{CORRECTED}{extension}" for path, folder in folders.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -400,29 +397,19 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
         states = Counter(result["state"] for result in done)
         gains = [result["expected_gain_db"] for result in done if result["state"] == "corrected"]
         gain = sum(gains) / len(gains) if gains else None
-        row = {
-            **group.words,
-            "profile": None if lens is None else str(profile),
+        counts = {
             "photos": len(done),
             "learned_from": number,
             "corrected": states["corrected"],
             "corrected_before": states["kept"],
             "left": states["left"],
             "failed": states["failed"],
-            "expected_gain_db": gain,  # of this run
         }
-        rows.append(row)
-        expected = f", expected gain {gain_words(gain)}" if gains else ""
-        display.result(
-            f"{', '.join(group.words.values())}: photos {len(done)}, learned from {number}, "
-            f"corrected {states['corrected'] + states['kept']}{expected}, "
-            f"left {states['left']}, failed {states['failed']}"
-        )
-        if number == 1:
-            display.note(
-                "it was learned from one photo; with five or more its blur is known better, and scenes do not"
-                " pass for it"
-            )
+        where = None if lens is None else str(profile)
+        rows.append({**group.words, "profile": where, **counts, "expected_gain_db": gain})
+        said = ", ".join(f"{name.replace('_', ' ')} {number}" for name, number in counts.items())
+        names = ", ".join(group.words.values())
+        display.result(f"{names}: {said}, expected gain {gain_words(gain)}")
     if any(row["corrected"] for row in rows):
         where = ", ".join(sorted({str(target.parent) for target in correction.targets.values()}))
         display.note(f"corrected photos are in {where}, lens profiles in {profiles}")

@@ -55,9 +55,7 @@ def _shot(path: Path) -> tuple[Path, str]:
 
 
 def refuse_photo(target: Path, photos: Sequence[Path]) -> None:
-    """Refuse a profile that would take the place of a folder or a photo."""
-    if target.is_dir():
-        raise UsageError(f"{target} is a folder; give the file of a lens profile")
+    """Refuse a profile that would take the place of a photo."""
     # a shell expands `--profile holiday/*.dng` to a profile and photos
     if target.suffix.lower() in ENDINGS or any(
         target.exists() and path.exists() and target.samefile(path) for path in photos

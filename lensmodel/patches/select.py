@@ -20,7 +20,7 @@ from typing import Final, Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
+from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, Frame, NoiseModel, Plane, StepHook, ignore_step, zone_of
 from lensmodel.patches.windows import BLOCKS_A_SIDE, Details, Windows, details_of, windows_of
@@ -170,7 +170,6 @@ selectors: Registry[Selector] = Registry(
 def select(
     plane: Plane,
     noise: NoiseModel,
-    frame: Frame,
     *,
     clip: float = 1.0,
     count: int = 48,
@@ -185,16 +184,10 @@ def select(
     They are of `size` pixels a side, and smaller where the shorter side of the frame is less than four of
     them. `coarse_noise` is that between 0.1 and 0.4 cycles/pixel where it is more than `noise`.
     """
-    if plane.shape != (frame.height, frame.width):
-        raise InvalidInputError(f"the plane is {plane.shape}, the frame {frame.height} x {frame.width}")
-    if count < 1:
-        raise InvalidInputError(f"count must be at least 1, got {count}")
-    if size < SMALLEST_PATCH:
-        raise InvalidInputError(f"patches need at least {SMALLEST_PATCH} px, got {size}")
-    chooser, shorter = selectors.resolve(selector), min(frame.height, frame.width)
-    _require_room(frame, SMALLEST_PATCH)
+    chooser, shorter = selectors.resolve(selector), min(plane.shape)
+    _require_room(Frame(*plane.shape), SMALLEST_PATCH)
     fitting = min(size, max(shorter // 4, min(shorter, 2 * SMALLEST_PATCH)))
-    windows = windows_of(plane, frame, noise, fitting // BLOCKS_A_SIDE, clip, on_step)
+    windows = windows_of(plane, noise, fitting // BLOCKS_A_SIDE, clip, on_step)
     reasons = first_reasons(windows)
     usable = np.flatnonzero(reasons == "")
     short = usable[_shortlist(windows.take(usable))]
@@ -267,7 +260,6 @@ MOST_A_CELL: Final = 4  # pooling the normal equations of four patches is worth 
 CELL_R: Final = 0.12  # half-diagonals (chosen): nearer windows tell of the same PSF
 CELL_ANGLE: Final = math.radians(24.0)  # the same around the centre, where blur changes less (chosen)
 MOST_APART: Final = 3.0  # window sides: farther ones are never of one cell (chosen)
-SPREAD_STEP: Final = 1.0  # window sides: nearer windows share pixels (chosen)
 MOST_STEPS: Final = 4  # window sides to the nearest seed that count; beyond, the better one wins (chosen)
 
 
@@ -332,7 +324,7 @@ def _seeds(windows: Windows, apart: NDArray[np.float64], count: int) -> list[int
     seeds: list[int] = []
     while len(seeds) < count and (left := np.flatnonzero(nearest >= 1.0)).size:
         fullness = in_sector.sum(axis=1) / np.maximum(share / share.sum(), 1e-9)
-        steps = np.minimum(nearest[left] / SPREAD_STEP, MOST_STEPS).astype(np.intp)
+        steps = np.minimum(nearest[left], MOST_STEPS).astype(np.intp)
         key = np.lexsort((-steps, fullness[ring[left]], in_sector[ring[left], octant[left]]))
         seeds.append(int(left[key[0]]))  # of equal ones the first, the best: the sort is stable
         in_sector[ring[seeds[-1]], octant[seeds[-1]]] += 1

@@ -122,9 +122,7 @@ class Windows:
         return Windows(size=self.size, **parts)
 
 
-def windows_of(
-    plane: Plane, frame: Frame, noise: NoiseModel, side: int, clip: float, on_step: StepHook
-) -> Windows:
+def windows_of(plane: Plane, noise: NoiseModel, side: int, clip: float, on_step: StepHook) -> Windows:
     """Sum over centred blocks of `side` pixels; a window of `BLOCKS_A_SIDE` of them a side starts at each."""
     height, width = plane.shape
     n, m = height // side, width // side
@@ -144,7 +142,7 @@ def windows_of(
     sums = {name: _square_sum(part, BLOCKS_A_SIDE) for name, part in blocks.items()}
     down, along = (np.arange(count - BLOCKS_A_SIDE + 1) * side for count in (n, m))
     tops, lefts = (each.ravel() for each in np.meshgrid(row + down, col + along, indexing="ij"))
-    r, phi = frame.polar(tops + (size - 1) / 2.0, lefts + (size - 1) / 2.0)
+    r, phi = Frame(*plane.shape).polar(tops + (size - 1) / 2.0, lefts + (size - 1) / 2.0)
     level = sums["level"] / area
     variance = sums["square"] / area - level**2 - _slope_variance(blocks["level"] / side**2, side)
     noise_variance = np.maximum(noise.variance(level), 1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from lensmodel.core.types import Frame, NoiseModel, Plane, ignore_step
+from lensmodel.core.types import NoiseModel, Plane, ignore_step
 from lensmodel.patches import Selector
 from lensmodel.patches.select import FEATURES, GoodRegionsSelector, RMapSelector, features_of
 from lensmodel.patches.windows import Details, Windows, details_of, windows_of
@@ -25,7 +25,7 @@ def plane_of(seed: int, sigma: float = SIGMA) -> Plane:
 
 
 def looked_at(plane: Plane, sigma: float = SIGMA) -> tuple[Windows, Details]:
-    windows = windows_of(plane, Frame(*plane.shape), NoiseModel.white(sigma), 32, 1.0, ignore_step)
+    windows = windows_of(plane, NoiseModel.white(sigma), 32, 1.0, ignore_step)
     return windows, details_of(plane, windows, 1.0)
 
 

@@ -5,13 +5,13 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError, UnknownMethodError
+from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.types import FieldPosition, Frame, NoiseModel, Plane, ignore_step
 from lensmodel.patches import Patch, Selection, r_map, select, selectors, windows
 from lensmodel.patches.select import EVIDENCE_FLOOR, Reason, part_of, require_enough
@@ -65,11 +65,11 @@ def part(photo: Plane) -> Plane:
 
 
 def chosen(plane: Plane, **options: int) -> Selection:
-    return select(plane, NOISE, Frame(*plane.shape), **options)
+    return select(plane, NOISE, **options)
 
 
 def windows_in(plane: Plane, side: int = 32, sigma: float = 0.003) -> Windows:
-    return windows_of(plane, Frame(*plane.shape), NoiseModel.white(sigma), side, 1.0, ignore_step)
+    return windows_of(plane, NoiseModel.white(sigma), side, 1.0, ignore_step)
 
 
 # ---- the r-map
@@ -138,7 +138,7 @@ def test_a_memory_mapped_plane_gives_the_same_and_progress_is_reported_to_the_en
     steps: list[tuple[int, int]] = []
     np.save(tmp_path / "plane.npy", part)
     mapped = np.load(tmp_path / "plane.npy", mmap_mode="r")
-    found = select(mapped, NOISE, Frame(480, 640), count=24, on_step=lambda *step: steps.append(step))
+    found = select(mapped, NOISE, count=24, on_step=lambda *step: steps.append(step))
 
     assert found.patches == chosen(part, count=24).patches
     assert steps[-1][0] == steps[-1][1]
@@ -148,10 +148,7 @@ def test_a_memory_mapped_plane_gives_the_same_and_progress_is_reported_to_the_en
 @pytest.mark.parametrize("selector", list(selectors))
 def test_scores_lie_in_zero_to_one_and_jpeg_counts_for_less(part: Plane, selector: str) -> None:
     raw, jpeg = (
-        [
-            p.score
-            for p in select(part, NOISE, Frame(480, 640), count=12, selector=selector, jpeg=jpeg).patches
-        ]
+        [p.score for p in select(part, NOISE, count=12, selector=selector, jpeg=jpeg).patches]
         for jpeg in (False, True)
     )
 
@@ -206,20 +203,6 @@ def test_a_photo_without_a_usable_window_is_refused_with_the_reason(
         chosen(plane)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"frame": Frame(10, 10)}, "frame"),
-        ({"count": 0}, "count"),
-        ({"size": 32}, "64 px"),
-        ({"selector": "best"}, "r-map"),
-    ],
-)
-def test_wrong_arguments_are_named(part: Plane, wrong: dict[str, Any], said: str) -> None:
-    with pytest.raises((InvalidInputError, UnknownMethodError), match=said):
-        select(part, NOISE, **{"frame": Frame(*part.shape), **wrong})
-
-
 # ---- evidence
 
 
@@ -270,8 +253,8 @@ def test_patches_avoid_a_sky_whose_noise_the_camera_smoothed(photo: Plane) -> No
     plane[:500] = vignetted_sky(500, 1500, 0.004, grain_px=2.0)
     single = NoiseModel.white(0.0006)  # from pixel to pixel it is as low as that
 
-    careless = select(plane, single, Frame(*plane.shape), count=36)
-    careful = select(plane, single, Frame(*plane.shape), count=36, coarse_noise=NoiseModel.white(0.02))
+    careless = select(plane, single, count=36)
+    careful = select(plane, single, count=36, coarse_noise=NoiseModel.white(0.02))
 
     assert any(patch.row + patch.size < 480 for patch in careless.patches)
     assert all(patch.row + patch.size > 480 for patch in careful.patches)

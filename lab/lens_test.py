@@ -28,7 +28,7 @@ from lensmodel import calibrate
 from lensmodel.core.types import ZONES, FieldPosition, Frame, LensSettings, Planes, zone_of
 from lensmodel.measured.edges import SlantedEdges
 from lensmodel.photo import develop
-from lensmodel.quality import edge_area, tangential_sagittal_mtf50
+from lensmodel.quality import edge_area, mtf50_from_kernel
 from lensmodel.report.lens_report import Range, lens_report
 from lensmodel.simulate import CameraLens, SimulatedCamera, photograph, write_photo
 
@@ -157,7 +157,11 @@ def by_chart(lens: GridLens, pitch_um: float) -> list[Sharpness]:
         write_photo(Path(folder) / "chart.dng", shot)
         photo = develop(Path(folder) / "chart.dng")
     psfs = SlantedEdges().measure([photo], size=31, channels=("g",))
-    return [Sharpness(p.position, *tangential_sagittal_mtf50(p.kernel, p.position.phi)) for p in psfs]
+    found = []
+    for psf in psfs:
+        t, s = (mtf50_from_kernel(psf.kernel, psf.position.phi + turn) for turn in (0.0, math.pi / 2))
+        found.append(Sharpness(psf.position, t, s))
+    return found
 
 
 def by_photos(lens: GridLens, photos: int, pitch_um: float) -> list[Sharpness]:

@@ -56,10 +56,7 @@ class EdgeResponse:
     frequencies: NDArray[np.float64]  # (n,), cycles/pixel along the normal of the edge, 0 to 1
     mtf: NDArray[np.float64]  # (n,), contrast, 1 at zero frequency
     mtf50: float  # lowest frequency where the contrast falls to a half; 1.0 where it does not fall so far
-    # how far the edge profile rises above its bright level and falls below its dark one, in percent of the
-    # step
-    overshoot: float
-    undershoot: float
+    overshoot: float  # how far the edge profile leaves its bright or its dark level, in percent of the step
     normal: float  # angle of the normal from dark to bright, radians, counter-clockwise from the right
     offset: float  # pixels along the normal from the middle of the crop to the edge
     step: float  # bright minus dark level
@@ -76,9 +73,8 @@ class EdgeResponse:
 def crossing(frequencies: ArrayLike, contrast: ArrayLike, level: float) -> float:
     """First frequency where `contrast` falls to `level`, linearly interpolated; the last if never."""
     f, c = np.asarray(frequencies, dtype=np.float64), np.asarray(contrast, dtype=np.float64)
-    below = np.flatnonzero(c < level)
-    below = below[below > 0]
-    if below.size == 0:
+    below = 1 + np.flatnonzero(c[1:] < level)
+    if not below.size:
         return float(f[-1])
     i = int(below[0])
     share = (c[i - 1] - level) / (c[i - 1] - c[i])
@@ -138,8 +134,7 @@ def slanted_edge(plane: NDArray[np.floating], measured: NDArray[np.bool_] | None
         frequencies=frequencies,
         mtf=mtf,
         mtf50=crossing(frequencies, mtf, 0.5),
-        overshoot=max(float(esf.max()) - bright, 0.0) / step * 100.0,
-        undershoot=max(dark - float(esf.min()), 0.0) / step * 100.0,
+        overshoot=max(float(esf.max()) - bright, dark - float(esf.min()), 0.0) / step * 100.0,
         normal=math.atan2(-d_col, d_row) if turned else math.atan2(-d_row, d_col),
         offset=float(-middle * d_col),
         step=step,
@@ -205,8 +200,7 @@ def _profile(
     full = np.convolve(per_side, np.ones(OVERSAMPLING), "same") >= 0.25 * OVERSAMPLING * np.median(
         per_side[: 4 * OVERSAMPLING]
     )
-    reach = int(np.argmin(full)) if not full.all() else full.size
-    reach -= 2
+    reach = int(np.append(full, False).argmin()) - 2
     if reach < 6 * OVERSAMPLING:
         raise NotEnoughEvidenceError("fewer than six pixels of ground beside the edge; crop it wider")
     keep = slice(limit - reach, limit + reach + 1)
@@ -271,11 +265,6 @@ def mtf50_from_kernel(kernel: Kernel, angle: float) -> float:
     """Frequency in cycles/pixel where the contrast along `angle` falls to one half, 1.0 if never."""
     f = np.linspace(0.0, 1.0, 513)  # steps of 1/512
     return crossing(f, mtf_from_kernel(kernel, angle, f), 0.5)
-
-
-def tangential_sagittal_mtf50(kernel: Kernel, phi: float) -> tuple[float, float]:
-    """MTF50 along u and along v of a kernel at field angle `phi`, cycles/pixel."""
-    return mtf50_from_kernel(kernel, phi), mtf50_from_kernel(kernel, phi + math.pi / 2.0)
 
 
 # --- finding the edges ---
@@ -433,11 +422,10 @@ def _edge_of(window: NDArray[np.floating], noise: NoiseModel, clip: float) -> Ed
 def _holds_nothing_else(crop: NDArray[np.float64], response: EdgeResponse, noise: NoiseModel) -> bool:
     """Whether an edge stands out, leans, is no wider than a third of its window, and explains it."""
     step, esf = response.step, response.esf
-    known = (response.mtf50, response.overshoot, response.undershoot, step, response.normal)
-    if not all(map(math.isfinite, known)) or step < _LEAST_STEP:
+    known = (response.mtf50, response.overshoot, step, response.normal)
+    if not all(map(math.isfinite, known)) or step < _LEAST_STEP or response.overshoot > _OVERSHOOT:
         return False
-    slant = math.radians(response.angle_deg)
-    if not _LEAST_SLANT <= slant <= _MOST_SLANT or max(response.overshoot, response.undershoot) > _OVERSHOOT:
+    if not _LEAST_SLANT <= math.radians(response.angle_deg) <= _MOST_SLANT:
         return False
     level = (esf - esf.min()) / step
     rising = response.esf_distance[(level > 0.15) & (level < 0.85)]  # between the overshoots

@@ -105,7 +105,7 @@ def correct(
 
         lensmodel correct holiday --profile my-24mm.lensprofile -o corrected
 
-        lensmodel correct one.dng --profile my-24mm.lensprofile -o sharp.jpg --strength 0.7 --halo 0.2
+        lensmodel correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json
 
     Exit status: 0 done, 1 some photos failed, 2 wrong usage.
     """

@@ -19,6 +19,7 @@ from lensmodel.core.psf import PsfSample, places_of
 from lensmodel.core.types import LensSettings
 from lensmodel.photo import develop
 
+_DETAILS: Final = ", ".join(map(str, measuring.DETAILS))
 # Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo
 USUAL_DETAIL: Final = 4000
 
@@ -73,21 +74,18 @@ def measure(
         for number, group in enumerate(groups):
             bar.show(description=f"{group[0].name}: measuring")
             sampler = partial(method.measure, size=size, on_step=partial(bar.part, number))
-            result: dict[str, Any]
             try:
                 result = _added(calibration, group, config.settings, sampler)
             except (LensModelError, OSError) as error:
                 result = files.failed(error)
                 shown.error(f"{group[0]}: {result['reason']}")
-            results.append({"photos": [str(path) for path in group], **result})
-            bar.show(number + 1)
             if result["state"] == "measured":
-                shown.result(
-                    f"{profile}: {result['places']} places measured on {group[0].name} "
-                    f"({result['estimator']}), expected error of a PSF {result['error']:.2f}"
-                )
+                said = f"{result['places']} places measured on {group[0].name} ({result['estimator']})"
+                shown.result(f"{profile}: {said}, expected error of a PSF {result['error']:.2f}")
             elif result["state"] == "known":
                 shown.note(f"{group[0]}: the profile has it already")
+            results.append({"photos": [str(path) for path in group], **result})
+            bar.show(number + 1)
     shown.document({"profile": str(profile) if profile.exists() else None, "results": results})
     if any(result["state"] == "failed" for result in results):
         raise typer.Exit(1)
@@ -124,12 +122,7 @@ def target(
         typer.Option(help="Size of the paper, in landscape orientation."),
     ] = "a3",
     detail: Annotated[
-        int,
-        typer.Option(
-            metavar="N",
-            help="Samples along the long side: 1000, 1400, 2000, 2800, 4000 or 5600. Choose the one nearest "
-            "to the number of pixels that the page will span in the photo.",
-        ),
+        int, typer.Option(metavar="N", help=f"Samples along the long side, {_DETAILS}: about as its pixels.")
     ] = USUAL_DETAIL,
     force: console.Force = False,
 ) -> None:
@@ -146,7 +139,7 @@ def target(
     Exit status: 0 written, 1 failed, 2 wrong usage.
     """
     if detail not in measuring.DETAILS:
-        raise UsageError(f"--detail must be one of {', '.join(map(str, measuring.DETAILS))}, got {detail}")
+        raise UsageError(f"--detail must be one of {_DETAILS}, got {detail}")
     files.refuse_existing(output, force=force)
     with files.as_usage():
         measuring.print_target(output, measuring.TargetPage(detail), paper=paper)

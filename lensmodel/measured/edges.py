@@ -67,10 +67,7 @@ class SlantedEdges(Measurer):
     # kernels are no mixtures of three Gaussians (chosen: half of the squares of five traced lenses are off by
     # .07 to .24)
     floor: ClassVar[float] = 0.15
-    nothing: ClassVar[str] = (
-        "no square could be measured, which takes two of its edges and the corner between them; photograph "
-        "dark squares or a checkerboard, in focus and unclipped"
-    )
+    shows: ClassVar[str] = "dark squares or a checkerboard with two edges of each and their corner"
 
     def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
         """Find squares of which two edges and their corner are seen."""

@@ -67,15 +67,14 @@ class Measurer(ABC):
     """One way to measure the PSF of a lens on photos made for it."""
 
     name: ClassVar[str]
-    version: ClassVar[int] = 1
     photos: ClassVar[int] = 1
     """How many photos one measurement takes."""
     floor: ClassVar[float]
     """Error that no window shows of itself."""
     most: ClassVar[float] = math.inf
     """Expected error from which on a kernel helps no model: blind ones are as good."""
-    nothing: ClassVar[str]
-    """What is missing where no place gives a PSF."""
+    shows: ClassVar[str]
+    """What the photos are to show."""
 
     def measure(
         self,
@@ -95,10 +94,7 @@ class Measurer(ABC):
         with nothing done of 1.
         """
         if len(photos) != self.photos:
-            raise InvalidInputError(
-                f"measuring by {self.name} takes {self.photos} photo{'s' * (self.photos > 1)} at a time, "
-                f"got {len(photos)}"
-            )
+            raise InvalidInputError(f"measuring by {self.name} takes {self.photos} photos, got {len(photos)}")
         if size < 3 or size % 2 == 0:
             raise InvalidInputError(f"kernels have an odd side of 3 pixels or more, got {size}")
         first, samples = photos[0], list[PsfSample]()
@@ -118,14 +114,17 @@ class Measurer(ABC):
                         settings.with_channel(channel),
                         photo=photo_id,
                         pixel_pitch_um=first.info.metadata.pixel_pitch_um,
-                        estimator=f"{MEASURED}{self.name}/{self.version}",
+                        estimator=f"{MEASURED}{self.name}/1",
                         error=error,
                         half_diagonal_px=first.frame.half_diagonal,
                     )
                     samples.append(sample)
             on_step(done, len(places))
         if not samples:
-            raise NotEnoughEvidenceError(self.nothing)
+            raise NotEnoughEvidenceError(
+                f"nothing in the photo gives a PSF by {self.name}; photograph {self.shows}, in focus, at low "
+                "noise and unclipped"
+            )
         return samples
 
     @abstractmethod

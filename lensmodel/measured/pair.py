@@ -44,15 +44,19 @@ class AperturePair(Measurer):
     photos: ClassVar[int] = 2
     floor: ClassVar[float] = 0.05  # of a lens at f/8 against diffraction (chosen)
     most: ClassVar[float] = 0.3
-    nothing: ClassVar[str] = (
-        "no part of the pair determines a PSF; photograph a scene with fine detail everywhere, flat and in "
-        "focus"
-    )
+    shows: ClassVar[str] = "a flat scene with fine detail everywhere"
 
     def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
         """Lay the closed photo under the open one, and find windows with most detail."""
-        _require_pair(*photos)
         opened, closed = photos
+        if opened.frame != closed.frame:
+            raise InvalidInputError("the photos of a pair must have one size")
+        n, m = (photo.info.metadata.aperture for photo in photos)
+        if n is not None and m is not None and 2.0 * np.log2(m / n) < _STOPS_APART:
+            raise InvalidInputError(
+                f"the second photo is at f/{m:g} and the first at f/{n:g}; close the lens by two stops or "
+                "more for the second, best to f/8"
+            )
         warp = self.register(opened, closed, on_step)
         corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
 
@@ -77,20 +81,6 @@ class AperturePair(Measurer):
         for degree in (0, 1, 3):
             warp = matched(warp, shown, plane, corners, self.side, degree, on_step)
         return warp
-
-
-def _require_pair(opened: LinearPhoto, closed: LinearPhoto) -> None:
-    if opened.frame != closed.frame:
-        raise InvalidInputError(
-            f"the photos of a pair must have one size, got {opened.frame.width} x {opened.frame.height} and "
-            f"{closed.frame.width} x {closed.frame.height}"
-        )
-    n, m = opened.info.metadata.aperture, closed.info.metadata.aperture
-    if n is not None and m is not None and 2.0 * np.log2(m / n) < _STOPS_APART:
-        raise InvalidInputError(
-            f"the second photo is at f/{m:g} and the first at f/{n:g}; close the lens by two stops or more "
-            "for the second, best to f/8"
-        )
 
 
 def _scene(closed: LinearPhoto, warp: Warp, window: Window, channel: Channel, size: int) -> Latent:

@@ -47,10 +47,7 @@ class Points(Measurer):
     name: ClassVar[str] = "points"
     floor: ClassVar[float] = 0.1  # three times that of one kernel, which may change in the cell (chosen)
     most: ClassVar[float] = 0.45
-    nothing: ClassVar[str] = (
-        "what looks like points of light gives no PSF: they are too faint, or parts of an ordinary scene; "
-        "photograph stars or pinholes before a dark ground, and expose longer"
-    )
+    shows: ClassVar[str] = "many points of light, stars or pinholes, before a dark ground"
 
     def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
         """Find points that are alone and unsaturated, by the cells of the frame."""

@@ -195,7 +195,7 @@ class Target(Measurer):
     name: ClassVar[str] = "target"
     floor: ClassVar[float] = 0.02  # of the models of light, tones and place (chosen)
     most: ClassVar[float] = 0.3
-    nothing: ClassVar[str] = "no window of the page determines a PSF; is the photo in focus?"
+    shows: ClassVar[str] = "the page that `lensmodel target` writes"
 
     def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
         """Find the page, its tones, and windows all over it."""

@@ -238,7 +238,7 @@ PLACE = {"idx": 0, "row": 10, "col": 20, "side": 144, "r": 0.3, "phi": 0.1, "err
 class AtTwoPlaces(Measurer):
     """Measures the middle in green and red, and a corner in green."""
 
-    name, version, floor, nothing = "quick", 3, 0.0, ""
+    name, floor, shows = "quick", 0.0, ""
 
     def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
         def psf_in(place: tuple[float, float], channel: Channel) -> Found:
@@ -269,7 +269,7 @@ def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.Monk
         (0, "g", 0.04),
         (1, "g", 0.04),
     ]
-    assert {(sample.estimator, sample.weight) for _, sample in samples} == {("measured-quick/3", 1.0)}
+    assert {(sample.estimator, sample.weight) for _, sample in samples} == {("measured-quick/1", 1.0)}
 
 
 def test_nonsense_of_a_child_is_refused(tmp_path: Path) -> None:

@@ -209,7 +209,7 @@ def test_a_match_says_how_far_the_photo_lies_beyond() -> None:
 class Sure(Measurer):
     """Measures one kernel in the same place, with these errors."""
 
-    name, floor, most, nothing = "sure", 0.0, 0.5, "nowhere"
+    name, floor, most, shows = "sure", 0.0, 0.5, "one kernel"
 
     def __init__(self, *errors: float) -> None:
         self.errors = errors
@@ -224,7 +224,7 @@ def test_a_psf_whose_error_is_not_known_is_left_out_and_the_others_stay() -> Non
     found = Sure(math.nan, 0.1, 0.6).measure([photo], size=9, channels=("g",))
 
     assert [psf.error for psf in found] == [0.1]
-    with pytest.raises(NotEnoughEvidenceError, match="nowhere"):
+    with pytest.raises(NotEnoughEvidenceError, match="photograph one kernel"):
         Sure(math.nan).measure([photo], size=9)
 
 

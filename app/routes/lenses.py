@@ -218,8 +218,8 @@ def get_lens_report(lens_id: str, form: Form, call: CallDep) -> Response:
     details = provenance(lens.serial, cameras, [photo.filename for photo in photos])
     test = replace(test, details=details)
     if form == "pdf":
-        from lensmodel.report.plots import pages, to_pdf  # noqa: PLC0415 - matplotlib is slow to import
+        from lensmodel.report.plots import document  # noqa: PLC0415 - matplotlib is slow to import
 
-        return Response(to_pdf(pages(test)), media_type=FORMS[form], headers=headers)
+        return Response(document(test, form), media_type=FORMS[form], headers=headers)
     text = to_csv(test) if form == "csv" else json.dumps(to_json(test))
     return Response(text, media_type=FORMS[form], headers=headers)

@@ -101,9 +101,9 @@ def _written(found: LensReport, form: str) -> bytes:
         return to_csv(found).encode()
     if form == ".json":
         return json.dumps(to_json(found), indent=1).encode()
-    from lensmodel.report.plots import pages, to_pdf, to_png  # noqa: PLC0415 - matplotlib, an extra
+    from lensmodel.report.plots import document  # noqa: PLC0415 - matplotlib, an extra
 
-    return to_pdf(pages(found)) if form == ".pdf" else to_png(pages(found)[0])
+    return document(found, "pdf" if form == ".pdf" else "png")
 
 
 def export(

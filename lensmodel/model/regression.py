@@ -6,20 +6,16 @@ So the sum over all pixels of all samples is one of kernels::
     f(u, v) = sum_i W_i C_i(u, v) / sum_i W_i,     W_i = q_i exp(-d_i^2 / 2)
 
 with C_i the sample's kernel in its own radial frame, d_i its distance in bandwidths (`query`), q_i its
-weight. The samples near a question are found in a kd-tree (paper, section 6.3). Departures from the paper:
-n in eq. (8) counts PSFs, not pixels; the smoothing over (u, v) is that of the spline, because a bandwidth of
-pixels would widen the PSF; unless the mode is "paper", kernels are scaled to the width of the place before
-averaging (`WidthField`).
-
-A mean cross-fades kernels of different widths, which is too wide where the blur grows outwards. Widths are
-smooth and few: the logarithms of the root mean square widths along u and v follow a polynomial of the place::
+weight, for the samples near the question in a kd-tree (paper, section 6.3). Departures from the paper: n in
+eq. (8) counts PSFs, not pixels; the smoothing over (u, v) is that of the spline, because a bandwidth of
+pixels would widen the PSF; unless the mode is "paper", kernels are scaled to the width of the place first: a
+mean of kernels of different widths is too wide where the blur grows outwards. The logarithms of the root mean
+square widths along u and v follow a polynomial of the place::
 
     log s = b0 + b1 r^2 + b2 r^4 + b3 x + b4 y + b5 x r^2 + b6 y r^2 + b7 (x^2 - y^2) + b8 x y + settings
 
 (third-order theory: coma grows as r, astigmatism and field curvature as r^2; a decentred copy adds odd terms
-in x and y). In the radial frame of a place (u outwards, v along the ring) the kernels of a ring are alike,
-and divided by the width of the place those of all rings nearly are. So sample i is seen from the question
-through the map of pixel offsets::
+in x and y). So sample i is seen from the question through the map of pixel offsets::
 
     M_i = L_i' S_i S^-1 L,      L = [[-sin phi, cos phi], [-cos phi, -sin phi]],   S = diag(s_u, s_v)
 
@@ -36,7 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
@@ -51,6 +47,7 @@ from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, query
 from lensmodel.model.query import PAPER, Part
 
+_KNOWN: Final = [0, 1, 2, 4]  # variables that are never unknown: place and wavelength
 _REACH: Final = 5.0  # bandwidths: a Gaussian has fallen to 4e-6 there
 _DROPPED: Final = 3e-5  # samples that together weigh less are left out (chosen: below single precision)
 _FEW: Final = 8  # neighbours at least, however far: a mean of fewer is no better than its worst (chosen)
@@ -62,14 +59,17 @@ _OUTWARD: Final = 0.5
 _WIDEST: Final = 255  # pixels: side of the widest kernel that is made for coarser pixels: memory
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """Samples by their points and weights, in a kd-tree of the variables that a question knows."""
+    """Samples by their points (n, 7) of `query` and weights (n,), 0 for those that take no part.
 
-    points: NDArray[np.float64]  # (n, 7), of `query`; NaN = unknown
-    weights: NDArray[np.float64]  # (n,), samples of weight 0 take no part
-    scale: NDArray[np.float64]  # (7,), bandwidths
-    _trees: dict[tuple[int, ...], scipy.spatial.cKDTree] = field(default_factory=dict)
+    A kd-tree holds the variables that every sample and question knows; `scale` (7,) are bandwidths.
+    """
+
+    def __init__(
+        self, points: NDArray[np.float64], weights: NDArray[np.float64], scale: NDArray[np.float64]
+    ) -> None:
+        self.points, self.weights, self.scale = points, weights, scale
+        self._tree = scipy.spatial.cKDTree((points / scale)[:, _KNOWN])
 
     def near(self, positions: Sequence[FieldPosition], settings: LensSettings) -> Answers:
         """Weigh the samples near each of some places."""
@@ -97,13 +97,8 @@ class Neighbourhood:
         return rows[kept], weight[kept] / weight[kept].sum()
 
     def within(self, asked: NDArray[np.float64], reach: float) -> NDArray[np.intp]:
-        """Rows within `reach` bandwidths of a point, and some beyond where a variable is not known."""
-        # a sample that does not know a variable is near in it: the tree leaves that one out
-        known = tuple(np.flatnonzero(~np.isnan(asked) & ~np.isnan(self.points).any(axis=0)).tolist())
-        scale = self.scale[list(known)]
-        if known not in self._trees:
-            self._trees[known] = scipy.spatial.cKDTree(self.points[:, known] / scale)
-        inside = self._trees[known].query_ball_point(asked[list(known)] / scale, reach)
+        """Rows within `reach` bandwidths of a point, but for settings."""
+        inside = self._tree.query_ball_point((asked / self.scale)[_KNOWN], reach)
         return np.sort(np.asarray(inside, dtype=np.intp))
 
 

@@ -6,9 +6,8 @@ import base64
 import io
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -63,17 +62,11 @@ _STYLE: Final[dict[str, Any]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Chart:
-    """One figure as SVG, with its title for those who cannot see it."""
+class Chart(NamedTuple):
+    """One figure, with its title for those who cannot see it."""
 
     title: str
-    svg: bytes
-
-    @property
-    def source(self) -> str:
-        """An address that holds the whole figure, for an `img` element."""
-        return "data:image/svg+xml;base64," + base64.b64encode(self.svg).decode("ascii")
+    source: str  # an address that holds the whole figure as SVG, for an `img` element
 
 
 # What the signs on the first page mean (Nyquist's frequency is .5)
@@ -95,54 +88,42 @@ def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> l
             figure, out = Figure(figsize=_CHART, layout="constrained"), io.BytesIO()
             _draw(figure, *panel)
             figure.savefig(out, format="svg", metadata={"Date": None})
-            drawn.append(Chart(panel[0], out.getvalue()))
+            content = base64.b64encode(out.getvalue()).decode("ascii")
+            drawn.append(Chart(panel[0], f"data:image/svg+xml;base64,{content}"))
     return drawn
 
 
-def pages(report: LensReport) -> list[Figure]:
-    """Draw what a photographer shows around on one page, and on others what testers ask of each aperture."""
-    found, panels = report.tested[0], _panels(report, report.tested, "c/px")
-    hatched = " (hatched: not known)" if found.unknown_share else ""
-    overview: list[Panel] = [
-        (
-            f"Sharpness over the picture{_at(found)}: MTF50, mean of T and S{hatched}",
-            partial(_overview, found),
-        ),
-        ("What becomes of a point of light in the centre and the corners", partial(_points, found)),
-    ]
-    notes = [
-        report.advice,
-        EXPLAINED,
-        report.facts,
-        *(f"{of}: {words}" for of, words in report.details.items()),
-    ]
-    with mpl.rc_context(_STYLE):
-        first = _page(report.name, overview, [2.6, 1.0], low=0.26, top=0.86)
-        _written(first, 0.945, [report.verdict], 11.0)
-        _written(first, 0.25, notes, 9.0)
-        parts = [panels[k : k + _A_PAGE] for k in range(0, len(panels), _A_PAGE)]
-        return [first, *(_page(report.name, part, [1.0] * _A_PAGE, low=0.02, top=0.93) for part in parts)]
-
-
-def to_pdf(figures: Iterable[Figure]) -> bytes:
-    """Write figures as the pages of a PDF."""
+def document(report: LensReport, form: Literal["pdf", "png"]) -> bytes:
+    """Write a report as PDF, or its first page as PNG."""
     out = io.BytesIO()
     about = {"CreationDate": None, "Creator": "lensmodel"}
-    with mpl.rc_context(_STYLE), PdfPages(out, metadata=about) as pdf:
-        for figure in figures:
-            pdf.savefig(figure)
-    return out.getvalue()
-
-
-def to_png(figure: Figure) -> bytes:
-    """Write a figure as PNG."""
-    out = io.BytesIO()
     with mpl.rc_context(_STYLE):
-        figure.savefig(out, format="png")
+        figures = _pages(report)
+        if form == "png":
+            figures[0].savefig(out, format="png")
+        else:
+            with PdfPages(out, metadata=about) as pdf:
+                for figure in figures:
+                    pdf.savefig(figure)
     return out.getvalue()
 
 
 # --- what stands where --------------------------------------------------------------------------
+
+
+def _pages(report: LensReport) -> list[Figure]:
+    """Draw what a photographer shows around on one page, and on others what testers ask of each aperture."""
+    found, panels = report.tested[0], _panels(report, report.tested, "c/px")
+    hatched = " (hatched: not known)" if found.unknown_share else ""
+    title = f"Sharpness over the picture{_at(found)}: MTF50, mean of T and S{hatched}"
+    points = "What becomes of a point of light in the centre and the corners"
+    overview: list[Panel] = [(title, partial(_overview, found)), (points, partial(_points, found))]
+    first = _page(report.name, overview, [2.6, 1.0], low=0.26, top=0.86)
+    details = [f"{of}: {words}" for of, words in report.details.items()]
+    _written(first, 0.945, [report.verdict], 11.0)
+    _written(first, 0.25, [report.advice, EXPLAINED, report.facts, *details], 9.0)
+    parts = [panels[k : k + _A_PAGE] for k in range(0, len(panels), _A_PAGE)]
+    return [first, *(_page(report.name, part, [1.0] * _A_PAGE, low=0.02, top=0.93) for part in parts)]
 
 
 def _panels(report: LensReport, tested: Iterable[ApertureReport], unit: Unit) -> list[Panel]:

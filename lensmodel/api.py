@@ -122,7 +122,7 @@ def calibrate(
         LensSettings(aperture, focal_mm, focus_m),
         estimator=estimator,
         kernel_size=kernel_size,
-        patch_count=patches,
+        patches=patches,
         selector=selector,
     )
     reasons = []

@@ -64,9 +64,7 @@ class PsfEstimator(Protocol):
         Parameters
         ----------
         patches : sequence of Plane, float32, each of shape (h, w)
-            Windows of 64 to 512 px of one color plane, linear light.
-        noise : sequence of NoiseModel
-            One for each patch.
+            Windows of 64 to 512 px of one color plane, linear light; `noise` has a model for each.
         size : int
             Odd side of the kernel, up to 55.
         green : PsfEstimate, optional
@@ -115,34 +113,26 @@ def usable(
     require_size(size)
     if len(patches) != len(noise) or not patches:
         raise InvalidInputError(f"every patch needs a noise model, got {len(patches)} and {len(noise)}")
-    kept, reasons = [], set[str]()
-    for patch, model in zip(patches, noise, strict=True):
+    for patch in patches:
         if patch.ndim != 2 or min(patch.shape) < _MIN_SIDE:
             raise InvalidInputError(f"a patch must be a plane of at least {_MIN_SIDE} px, got {patch.shape}")
         if not np.isfinite(patch).all():
             raise InvalidInputError("a patch must be finite; mask or replace NaN and infinity first")
-        if reason := _unfit(patch, model):
-            reasons.add(reason)
-        else:
-            kept.append((patch, model))
+    kept = [pair for pair in zip(patches, noise, strict=True) if _tells(*pair)]
     if not kept:
         raise NotEnoughEvidenceError(
-            f"no patch determines a kernel ({', '.join(sorted(reasons))}); choose parts with fine detail"
+            "no patch determines a kernel: they are flat, clipped or noise; choose parts with fine detail"
         )
     return kept
 
 
-def _unfit(patch: Plane, model: NoiseModel) -> str | None:
-    sigma = model.sigma_at(float(patch.mean()))
-    if float(patch.std()) <= _CONTRAST_IN_NOISE * sigma or float(np.ptp(patch)) < 1e-6:
-        return "flat"
-    if float((patch >= 0.995).mean()) > _CLIPPED_SHARE:
-        return "clipped"
+def _tells(patch: Plane, model: NoiseModel) -> bool:
+    """Whether a patch is neither flat nor clipped, nor noise alone."""
+    least = max(_CONTRAST_IN_NOISE * model.sigma_at(float(patch.mean())), 1e-7)
     # White noise has as much power between neighbours as anywhere; a picture has far less.
     steps = 0.5 * float(np.var(np.diff(patch, axis=0)) + np.var(np.diff(patch, axis=1)))
-    if steps > 1.4 * float(patch.var()):
-        return "noise"
-    return None
+    clipped = float((patch >= 0.995).mean())
+    return float(patch.std()) > least and clipped <= _CLIPPED_SHARE and steps <= 1.4 * float(patch.var())
 
 
 def weight_of(error: float) -> float:

@@ -15,24 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.blind.estimator import PsfEstimate, finished, usable, weight_of
+from lensmodel.core import types
 from lensmodel.core.psf import EncodedPatch, PatchKind, PsfSample, centred, resized, support_radius
-from lensmodel.core.types import (
-    CHANNELS,
-    FieldPosition,
-    LensSettings,
-    NoiseModel,
-    Plane,
-    StepHook,
-    ignore_step,
-)
 from lensmodel.neural.network import WINDOW, FieldNetwork, conditions_of, patch_statistics, to_octant
 from lensmodel.patches.select import Patch, Selection, spread_evenly
 from lensmodel.photo.values import LinearPhoto
 
-_DEVELOPED_NOISE: Final = NoiseModel(shot=0.0, read=1e-6)  # of developed planes in the training
+_DEVELOPED_NOISE: Final = types.NoiseModel(shot=0.0, read=1e-6)  # of developed planes in the training
 _HELD: Final = 0.999  # share of its light that the array of a sample's kernel holds (chosen)
 _LEAST_SIDE: Final = 15  # pixels: of a sample's kernel (chosen)
-_ANYWHERE: Final = FieldPosition(0.5, 0.6)  # of patches of which nobody says where they lie (chosen)
+_ANYWHERE: Final = types.FieldPosition(0.5, 0.6)  # of patches of which nobody says where they lie (chosen)
 _MOSAIC: Final = ((0, 1), (1, 2))  # by which developed planes are sampled
 
 
@@ -56,10 +48,10 @@ class LearnedEstimator:
         developed: LinearPhoto,
         patches: Sequence[Patch],
         *,
-        settings: LensSettings,
+        settings: types.LensSettings,
         photo: str,
         size: int,
-        on_step: StepHook = ignore_step,
+        on_step: types.StepHook = types.ignore_step,
     ) -> list[PsfSample]:
         """Encode patches of a photo beside each other."""
         network = FieldNetwork.load()
@@ -82,7 +74,7 @@ class LearnedEstimator:
             answer = network.query(alone, place, conditions)
             held = 2 * max(support_radius(kernel, _HELD) for kernel in answer.kernels) + 1
             side = min(max(held, _LEAST_SIDE), size, answer.kernels.shape[-1])
-            for channel, kernel, error in zip(CHANNELS, answer.kernels, answer.error, strict=True):
+            for channel, kernel, error in zip(types.CHANNELS, answer.kernels, answer.error, strict=True):
                 samples.append(
                     PsfSample(
                         kernel=centred(resized(kernel, side)),
@@ -101,8 +93,8 @@ class LearnedEstimator:
 
     def estimate(
         self,
-        patches: Sequence[Plane],
-        noise: Sequence[NoiseModel],
+        patches: Sequence[types.Plane],
+        noise: Sequence[types.NoiseModel],
         *,
         size: int = 31,
         green: PsfEstimate | None = None,
@@ -112,7 +104,7 @@ class LearnedEstimator:
         The middle 128 pixels of a patch are used; a smaller one is continued by its mirror image.
         """
         kept = usable(patches, noise, size)
-        network, conditions = FieldNetwork.load(), conditions_of(LensSettings(), None)
+        network, conditions = FieldNetwork.load(), conditions_of(types.LensSettings(), None)
         colours = _colours(_MOSAIC, 0, 0)
         xy = np.tile(_ANYWHERE.xy, (len(kept), 1))
         rows = [
@@ -141,7 +133,7 @@ def _colours(pattern: Sequence[Sequence[int]], row: int, col: int) -> NDArray[np
     return np.tile(turned, (WINDOW // 2, WINDOW // 2))
 
 
-def _middle(plane: Plane) -> Plane:
+def _middle(plane: types.Plane) -> types.Plane:
     missing = [max(WINDOW - side, 0) for side in plane.shape]
     padded = np.pad(plane, [(short // 2, short - short // 2) for short in missing], "symmetric")
     top, left = ((side - WINDOW) // 2 for side in padded.shape)

@@ -223,7 +223,7 @@ class PatchRecurrence:
         while levels > 1 and min(level_shape(scaled[0].y.shape, levels - 1)) < 40:
             levels -= 1
         kernel = delta(_LEAST_SIDE) if green is None else green.kernel
-        latent = [view.y for view in (s.at(levels - 1) for s in scaled)]
+        latent = [s.at(levels - 1).y for s in scaled]
         for level in reversed(range(levels)):
             side = max(_LEAST_SIDE, _odd(size / ALPHA**level))
             views = [s.at(level) for s in scaled]
@@ -262,12 +262,10 @@ def normal_equations(
         b(u)    = sum_p y(p) x(p - u)     - N s² h(-u)
     """
     half = side // 2
-    margin = _BORDER
-    inner = x[margin : x.shape[0] - margin, margin : x.shape[1] - margin]
-    reach = margin + half
-    target = y[reach : y.shape[0] - reach, reach : y.shape[1] - reach]
+    reach = _BORDER + half
+    target = y[reach:-reach, reach:-reach]
     n = target.size
-    gram, cross = window_products(inner, target, side)
+    gram, cross = window_products(x[_BORDER:-_BORDER, _BORDER:-_BORDER], target, side)
     a, b = gram[::-1, ::-1].copy(), cross[::-1].copy()
     acf = n * noise**2 * fft.irfft2(np.abs(fft.rfft2(response)) ** 2, s=response.shape)
     lags = np.arange(1 - side, side)

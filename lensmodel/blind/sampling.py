@@ -26,14 +26,7 @@ import numpy as np
 from lensmodel import photo
 from lensmodel.blind import PhotoEstimator, PsfEstimate, PsfEstimator, estimators
 from lensmodel.blind.estimator import require_size, weight_of
-from lensmodel.core import processes
-from lensmodel.core.errors import (
-    InvalidInputError,
-    LensModelError,
-    NotEnoughEvidenceError,
-    NoUsablePatchesError,
-    UnknownMethodError,
-)
+from lensmodel.core import errors, processes
 from lensmodel.core.files import from_json, save_array, to_json
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, Channel, LensSettings, StepHook, ignore_step
@@ -77,26 +70,23 @@ def configured(
     *,
     estimator: str | PsfEstimator | None = None,
     kernel_size: int | None = None,
-    patch_count: int | None = None,
+    patches: int | None = None,
     selector: str | Selector = "r-map",
 ) -> Config:
     """Return a preset with what is asked for instead, before any work; None is as there."""
     if model not in PRESETS:
-        raise UnknownMethodError(f"no model {model!r}; known: {', '.join(PRESETS)}")
+        raise errors.UnknownMethodError(f"no model {model!r}; known: {', '.join(PRESETS)}")
     preset = PRESETS[model]
-    usual = estimators.resolve(preset.estimator)
-    method = usual if estimator is None else estimators.resolve(estimator)
-    if isinstance(usual, PhotoEstimator) and not isinstance(
-        method, PhotoEstimator
-    ):  # of fewer, smaller kernels
+    asked = {"estimator": estimator, "kernel_size": kernel_size, "patches": patches}
+    usual, method = (estimators.resolve(name) for name in (preset.estimator, estimator or preset.estimator))
+    if isinstance(usual, PhotoEstimator) and not isinstance(method, PhotoEstimator):
         preset = replace(preset, kernel_size=DEFAULT_KERNEL_SIZE, patches=KERNEL_PATCHES)
-    asked = {"estimator": estimator, "kernel_size": kernel_size, "patches": patch_count}
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     config = replace(preset, selector=selector, settings=settings, **given)
     require_size(config.kernel_size)
     selectors.resolve(selector)
     if config.patches < 1:
-        raise InvalidInputError(f"patches must be at least 1, got {config.patches}")
+        raise errors.InvalidInputError(f"patches must be at least 1, got {config.patches}")
     return config
 
 
@@ -123,7 +113,7 @@ def load_developed(folder: Path) -> LinearPhoto:
         planes = np.load(folder / "planes.npy", mmap_mode="r", allow_pickle=False)
         stored = json.loads((folder / "photo.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InvalidInputError(f"{folder} holds no developed photo; develop it again") from error
+        raise errors.InvalidInputError(f"{folder} holds no developed photo; develop it again") from error
     return from_json(LinearPhoto, {**stored, "planes": planes})
 
 
@@ -208,7 +198,7 @@ def estimate_cell(
         try:
             noise = [developed.noise[index]] * len(planes)
             estimate = method.estimate(planes, noise, size=size, green=green)
-        except NotEnoughEvidenceError:
+        except errors.NotEnoughEvidenceError:
             if channel == "g":
                 raise
             log.info("channel %s of a cell at r=%.2f gave no kernel", channel, group[0].position.r)
@@ -257,7 +247,7 @@ class CalibrationEvent:
     done: int = 0
     total: int = 0
     detail: str = ""
-    error: LensModelError | OSError | None = None
+    error: errors.LensModelError | OSError | None = None
 
 
 EventHook = Callable[[CalibrationEvent], None]
@@ -311,7 +301,7 @@ def samples_of_photo(
                 for group, job in zip(groups, jobs, strict=True):
                     try:
                         samples += job.result()
-                    except NotEnoughEvidenceError as error:
+                    except errors.NotEnoughEvidenceError as error:
                         log.info("a cell of %s was dropped: %s", path.name, error)
                     done += len(group)
                     on_event(CalibrationEvent(path, "estimating", done, total))
@@ -319,7 +309,7 @@ def samples_of_photo(
                 for job in jobs:
                     job.cancel()  # those not begun, after an error: leaving `with` waits only for what runs
     if not samples:
-        raise NoUsablePatchesError(
+        raise errors.NoUsablePatchesError(
             f"none of the {total} patches of {path.name} determines a PSF; "
             "use a photo with more fine detail in focus"
         )

@@ -20,14 +20,7 @@ from typing import Annotated, Any, Final
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress, TextColumn
 
 from lensmodel.core import types
 from lensmodel.core.errors import InvalidInputError
@@ -89,7 +82,7 @@ class Display:
         """One bar with share and time left, on a terminal alone."""
         bar = Bar(
             TextColumn("{task.description}", markup=False),  # names of files may hold brackets
-            *(BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn()),
+            *Progress.get_default_columns()[1:],
             console=Console(file=sys.stderr),
             disable=self.quiet or not sys.stderr.isatty(),
             transient=True,

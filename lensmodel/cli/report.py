@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -63,23 +62,15 @@ def report(
 def measured(profile: Path, aperture: float | None) -> LensReport:
     """Report on the lens of a profile."""
     known = files.profile_at(profile)
+    names, cameras = known.names, [camera_name(camera.maker, camera.model) for camera in known.cameras]
     with files.as_usage():
-        asked = None if aperture is None else [LensSettings(aperture=aperture).aperture or aperture]
+        LensSettings(aperture=aperture)
         return lens_report(
             known.model,
-            name_of(known.names) or profile.stem,
-            apertures=asked,
-            details=provenance(
-                known.names.get("serial"),
-                [camera_name(camera.maker, camera.model) for camera in known.cameras],
-                list(known.photos.values()),
-            ),
+            names.get("label") or full_name(names.get("maker"), names.get("model")) or profile.stem,
+            apertures=None if aperture is None else [aperture],
+            details=provenance(names.get("serial"), cameras, list(known.photos.values())),
         )
-
-
-def name_of(lens: Mapping[str, str]) -> str:
-    """What to call a lens: its label, or maker and model without saying the maker twice."""
-    return lens.get("label") or full_name(lens.get("maker"), lens.get("model"))
 
 
 def _targets(output: Path | None) -> tuple[Path, ...]:
@@ -88,10 +79,6 @@ def _targets(output: Path | None) -> tuple[Path, ...]:
         return ()
     if output.suffix.lower() in FORMS and not output.is_dir():
         return (output,)
-    if output.suffix[1:].isalpha() and not output.is_dir():
-        raise UsageError(
-            f"a report is no {output.suffix}: end {output} in {', '.join(FORMS)}, or give a folder"
-        )
     return tuple(output / f"report{form}" for form in FORMS)
 
 

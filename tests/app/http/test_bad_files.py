@@ -78,7 +78,7 @@ def test_a_bad_file_is_refused_by_whoever_reads_it(name: str, tmp_path: Path) ->
     path.write_bytes(OWN[name])
 
     with pytest.raises(LensModelError) as refusal:
-        sampling.samples_of_photo(path, sampling.configured("default", LensSettings(4.0), patch_count=2))
+        sampling.samples_of_photo(path, sampling.configured("default", LensSettings(4.0), patches=2))
 
     assert refusal.value.code in KNOWN_CODES
     assert len(str(refusal.value)) > 15
@@ -92,7 +92,7 @@ def test_a_thumbnail_and_detail_in_one_place_tell_nothing(
 ) -> None:
     photo().save(tmp_path / "p.jpg", quality=95)
     # the fewest patches of which as much evidence is asked as of the default
-    strict = sampling.configured("default", LensSettings(4.0), patch_count=18)
+    strict = sampling.configured("default", LensSettings(4.0), patches=18)
 
     with pytest.raises(NoUsablePatchesError):
         sampling.samples_of_photo(tmp_path / "p.jpg", strict)

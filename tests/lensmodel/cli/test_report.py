@@ -114,7 +114,6 @@ def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        ("report", NAME, "-o", "mine.html"),
         ("report", NAME, "-o", "out", "--against", "nobodys.lensprofile"),
         ("report", "nobodys.lensprofile", "-o", "out"),
         ("target", "."),

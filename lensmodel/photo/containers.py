@@ -237,7 +237,6 @@ def write_strip(file: BinaryIO, tags: Written, pixels: NDArray[np.generic]) -> N
         277: (SHORT, samples),
         278: (LONG, height),
         279: (LONG, pixels.nbytes),
-        284: (SHORT, 1),  # interleaved
     }
     at = len(laid_out(whole))
     at += -at % 16
@@ -313,9 +312,7 @@ def sniff(head: bytes) -> FileKind:
             if kind in _PARSERS:
                 return cast("FileKind", kind)
             raise errors.UnsupportedFormatError(f"{kind} files are not read; {_READABLE}")
-    if not head:
-        raise errors.NotAnImageError(f"the file is empty; {_READABLE}")
-    said = f"the first bytes ({head[:8].hex(' ')}) belong to no photo format"
+    said = f"the first bytes ({head[:8].hex(' ')}) belong to no photo format" if head else "the file is empty"
     raise errors.NotAnImageError(f"{said}; {_READABLE}")
 
 
@@ -424,8 +421,7 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     width, height, bits, colour = struct.unpack(">IIBB", first[8:18])
     channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0)
     if not (width and height and channels and bits in {1, 2, 4, 8, 16}):
-        said = f"{width} x {height}, {bits} bits, type {colour}"
-        raise errors.NotAnImageError(f"the PNG's header is impossible: {said}")
+        raise errors.NotAnImageError(f"no PNG has {width} x {height} pixels of {bits} bits, type {colour}")
     check_size(width, height, len(buffer), limits)  # before a bomb's end is missed
     found = dict[bytes, bytes]()
     for name, start, length in png_chunks(buffer):
@@ -572,9 +568,8 @@ def require_known_mosaic(rows: Sequence[str]) -> None:
 
 def _check_numbers(tags: Tags) -> None:
     """Refuse numbers that are not read, or stand for other things than light, before they are stored."""
-    kind, samples, bits = tags.integer(262, 1), tags.integer(277, 1), tags.integer(258, 1)
+    kind, samples, bits, form = (tags.integer(tag, 1) for tag in (262, 277, 258, 339))
     read = kind in {1, 2} and (1, 3)[kind == 2] <= samples <= 4
-    form = tags.integer(339, 1)
     if not read or bits not in _DEPTHS.get(form, ()):
         colours = _OTHER_COLOURS.get(kind, f"PhotometricInterpretation {kind}")
         raise errors.UnsupportedFormatError(

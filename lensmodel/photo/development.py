@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC
 from pathlib import Path
@@ -65,7 +65,7 @@ def _opened(path: Path, limits: values.Limits) -> Iterator[tuple[Said, rawpy.Raw
         # no camera stores a picture higher than wide and says that it lies
         upright = raw is None and height > width and metadata.orientation == 1
         turned = upright and metadata.camera_model is not None
-        yield said, raw, values.PhotoInfo(header.kind, width, height, metadata, said.is_centred, turned)
+        yield said, raw, values.PhotoInfo(header.kind, width, height, metadata, said.placed()[1], turned)
 
 
 def develop(
@@ -122,7 +122,7 @@ def develop(
 def photo_from_array(
     planes: ArrayLike,
     *,
-    noise: NoiseModel | Sequence[NoiseModel] | None = None,
+    noise: NoiseModel | None = None,
     clip: float = 1.0,
     aperture: float | None = None,
     focal_mm: float | None = None,
@@ -135,7 +135,7 @@ def photo_from_array(
     ----------
     planes : array_like of float, shape (3, height, width)
         Red, green and blue in linear light: black 0, saturation at `clip`; kept as float32.
-    noise : NoiseModel or sequence of three, optional
+    noise : NoiseModel, optional
         Variance of the pixels against their level; None measures it on the flat places of each plane.
     clip : float
         Level at which the sensor saturates.
@@ -161,12 +161,7 @@ def photo_from_array(
         raise errors.InvalidInputError(f"clip must be a positive level, got {clip}")
     LensSettings(aperture, focal_mm, focus_m)  # refuses what no lens has
     if pixel_pitch_um is not None and not 0.0 < pixel_pitch_um < math.inf:
-        said = f"the pixel pitch must be positive micrometres, got {pixel_pitch_um}; leave it out if unknown"
-        raise errors.InvalidInputError(said)
-    given = (noise,) * 3 if isinstance(noise, NoiseModel) else noise
-    models = tuple(estimate_noise(plane, clip) for plane in array) if given is None else tuple(given)
-    if len(models) != len(CHANNELS):
-        raise errors.InvalidInputError(f"noise needs one model, or one for each plane, got {len(models)}")
+        raise errors.InvalidInputError(f"the pixel pitch must be positive micrometres, got {pixel_pitch_um}")
     metadata = values.PhotoMetadata(
         aperture=aperture, focal_mm=focal_mm, focus_m=focus_m, pixel_pitch_um=pixel_pitch_um
     )
@@ -174,7 +169,7 @@ def photo_from_array(
     return values.LinearPhoto(
         planes=array,
         frame=frame,
-        noise=models,
+        noise=tuple(noise or estimate_noise(plane, clip) for plane in array),
         clip=(clip,) * 3,
         info=values.PhotoInfo("tiff", frame.width, frame.height, metadata),
         encoding=values.Encoding(bit_depth=32, transfer="linear", metadata=metadata),
@@ -189,7 +184,8 @@ fields, as the tests do again. The noise of the planes is not white: at low freq
 the power of the sensor's in red and blue and 1.9 times in green, at the highest about half."""
 
 _FULL: Final = 65535.0  # 16 bits
-_WHITE: Final = 50717  # tag of the white level of a DNG, of all channels or of each: DNG 1.6, chapter 4
+# Tags of a DNG: white level of all channels or of each, and stops by which to brighten it: DNG 1.6, chapter 4
+_WHITE, _BASELINE_EXPOSURE = 50717, 50730
 _ORIENTATIONS: Final = {3: 3, 5: 8, 6: 6}  # how LibRaw says that a picture is turned -> EXIF orientation
 
 _LEAST_SHARE: Final = 0.25  # of the strongest that a channel is balanced by: it costs two of 16 bits
@@ -259,7 +255,7 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: values.PhotoInfo) -> values
     planes = _developed(raw, white, balance, stated)
     _, height, width = planes.shape
     noise = _plane_noise(planes, sensor_noise, balance)
-    to_srgb, xyz_to_camera = _colour(raw, balance)
+    (to_srgb, xyz_to_camera), stops = _colour(raw, balance), tags.number(_BASELINE_EXPOSURE)
     return values.LinearPhoto(
         planes=planes,
         frame=Frame(height, width),
@@ -272,7 +268,9 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: values.PhotoInfo) -> values
             white_balance=balance,
             to_srgb=to_srgb,
             xyz_to_camera=xyz_to_camera,
-            baseline_exposure=said.baseline_exposure(),
+            baseline_exposure=stops
+            if stops is not None and abs(stops) <= 10.0
+            else None,  # others are absurd
             opcodes_2=opcodes,
             opcodes_3=tags.raw(OPCODES_3),
         ),

@@ -50,9 +50,7 @@ class LateralColour:
 
     def displacement(self, r: float, channel: Channel) -> float:
         """Pixels outwards by which a channel's image lies beyond the green one at radius `r`."""
-        if channel == "g":
-            return 0.0
-        a, b, c, v = self.red if channel == "r" else self.blue
+        a, b, c, v = {"r": self.red, "g": IDENTITY, "b": self.blue}[channel]
         return float(r * ((v - 1.0) + c * r + b * r**2 + a * r**3) * self.half_diagonal)
 
     def counted_in(self, half_diagonal: float) -> LateralColour:

@@ -28,9 +28,7 @@ from lensmodel.photo import containers
 from lensmodel.photo.containers import ASCII, RATIONAL, Buffer, Header, Tag, Tags, TiffReader, Value, Written
 from lensmodel.photo.values import SOFTWARE, LensIdentity, PhotoMetadata, SerialSource
 
-_PLACEHOLDER: Final = re.compile(
-    r"[0.\-_ x?]*|(.)\1{5,}|none|no lens|n/?a|unknown|null|manual", re.IGNORECASE
-)
+_PLACEHOLDER: Final = re.compile(r"(?i)[0.\-_ x?]*|(.)\1{5,}|none|no lens|n/?a|unknown|null|manual")
 _NO_LENS: Final = re.compile(
     r"(?<![\d.])0+(\.0+)?(-0+(\.0+)?)?\s*mm|-{2,}\s*mm"
     r"|\b(no (cpu|lens|data)|not attached|(unknown|manual) lens)\b"
@@ -101,19 +99,10 @@ class Said:
             exposure_s=_first_within(1e-7, 1e6, number(0x829A), _quotient(xmp.get("exif:ExposureTime"))),
             taken_at=self._taken_at(),
             orientation=int(_first_within(1.0, 8.0, number(0x0112)) or 1),
-            pixel_pitch_um=self._placed()[0],
+            pixel_pitch_um=self.placed()[0],
             artist=text(0x013B) or xmp.get("dc:creator"),
             copyright=text(0x8298) or xmp.get("dc:rights"),
         )
-
-    @property
-    def is_centred(self) -> bool:
-        """Whether a picture shows its whole sensor or the middle of it, as cameras crop, no program."""
-        return self._placed()[1]
-
-    def baseline_exposure(self) -> float | None:
-        """Stops by which a DNG asks to be brightened, None where it does not say or is absurd."""
-        return _first_within(-10.0, 10.0, self.tags.number(0xC62A))
 
     @property
     def adobe_rgb(self) -> bool:
@@ -153,7 +142,7 @@ class Said:
         plain = (math.inf if value is not None and value >= 4294967295 else value for value in values)
         return next((value for value in plain if value is not None and value > 0), None)
 
-    def _placed(self) -> tuple[float | None, bool]:
+    def placed(self) -> tuple[float | None, bool]:
         """Pitch of the pixels in micrometres, and whether they are all of the sensor or its middle.
 
         Programs that scale a photo down rarely correct the focal plane resolution; then width times pitch is
@@ -387,8 +376,7 @@ def find_location(buffer: Buffer) -> tuple[list[tuple[int, bytes]], bool]:
         start, end = match.span(match.lastindex or 0)
         spans.append((start, b" " * (end - start)))
     spans = [(at, data) for at, data in spans if bytes(buffer[at : at + len(data)]) != data]
-    complete = len(blocks) <= MAX_BLOCKS and len(words) <= MAX_WORDS
-    return _with_checksums(buffer, chunks, spans), complete
+    return _with_checksums(buffer, chunks, spans), len(blocks) <= MAX_BLOCKS and len(words) <= MAX_WORDS
 
 
 def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[tuple[int, bytes]]:

@@ -74,8 +74,6 @@ def graininess(plane: Plane, noise: NoiseModel, clip: float = 1.0) -> float:
     Demosaicing leaves 6 to 9, a camera's own denoising 40 and more.
     """
     fine = _sampled(np.asarray(plane, dtype=np.float32))
-    if min(fine.shape) < GRAIN:
-        return 1.0
     levels = np.quantile(fine[::GRAIN, ::GRAIN], _GRAIN_LEVELS)
     single = noise.variance(levels)
     several = estimate_noise(block_means(fine, GRAIN), clip).variance(levels)
@@ -87,10 +85,8 @@ def _sampled(plane: Plane) -> Plane:
     """Evenly spaced bands of rows of a large plane: more pixels would not change the fit."""
     band = 8 * BLOCK
     every = plane.size // _ENOUGH_PIXELS + 1
-    if every == 1:
-        return plane
     bands = [plane[row : row + band] for row in range(0, plane.shape[0] - band + 1, every * band)]
-    return np.concatenate(bands) if bands else plane
+    return np.concatenate(bands) if every > 1 and bands else plane
 
 
 def _levels(plane: Plane, clip: float) -> NDArray[np.float64]:
@@ -99,8 +95,6 @@ def _levels(plane: Plane, clip: float) -> NDArray[np.float64]:
     Texture is judged on the low-passed plane and noise on the high-passed one, so that the choice does not
     favour blocks whose noise happens to be small.
     """
-    if min(plane.shape) < 3 * BLOCK:
-        return np.zeros((0, 3))
     low = ndimage.gaussian_filter(plane, 2.0, mode="nearest", truncate=3.0)
     blocks, high = _blocks(plane), _blocks(ndimage.convolve(plane, _HIGH_PASS, mode="nearest"))
     mean, texture = blocks.mean(axis=1, dtype=np.float64), _blocks(low).std(axis=1, dtype=np.float64)

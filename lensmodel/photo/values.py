@@ -27,7 +27,6 @@ SOFTWARE: Final = "lensmodel"  # names this program in the files that it writes
 CORRECTED: Final = "-corrected"
 """Ends the names of what `lensmodel correct` wrote: it says nothing about its lens any more."""
 
-
 FileKind: TypeAlias = Literal["raw", "dng", "tiff", "png", "jpeg"]
 SerialSource: TypeAlias = Literal["exif", "makernote", "xmp", "user", "none"]
 Transfer: TypeAlias = Literal["srgb", "linear", "icc"]

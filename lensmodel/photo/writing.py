@@ -206,8 +206,6 @@ BAYER_PATTERNS: Final = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 XYZ_TO_SRGB: Final = np.linalg.inv(SRGB_TO_XYZ_D65)
 
-UNKNOWN: Final = PhotoMetadata()
-
 
 def write_bayer_dng(
     path: str | Path,
@@ -218,18 +216,17 @@ def write_bayer_dng(
     pattern: str = "RGGB",
     color_matrix: ArrayLike = XYZ_TO_SRGB,
     as_shot_neutral: Sequence[float] = (1.0, 1.0, 1.0),
-    metadata: PhotoMetadata = UNKNOWN,
+    metadata: PhotoMetadata | None = None,
     baseline_exposure: float | None = None,
 ) -> None:
     """Write a raw mosaic as an uncompressed DNG; the file appears whole or not at all."""
+    metadata = metadata or PhotoMetadata()
     tags = {
         **written_tags(metadata),
         **dng_tags(metadata, color_matrix, as_shot_neutral, baseline_exposure),
         262: (SHORT, 32803),  # PhotometricInterpretation: a colour filter array (TIFF/EP)
         33421: (SHORT, (2, 2)),  # CFARepeatPatternDim
         33422: (BYTE, bytes("RGB".index(letter) for letter in pattern)),  # CFAPattern
-        50710: (BYTE, b"\x00\x01\x02"),  # CFAPlaneColor: red, green, blue
-        50711: (SHORT, 1),  # CFALayout: rectangular
         50714: (SHORT, black),
         50717: (SHORT, white),
     }
@@ -251,7 +248,6 @@ def dng_tags(
         50706: (BYTE, bytes((1, 4, 0, 0))),  # DNGVersion
         50707: (BYTE, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
         50708: (containers.ASCII, unique),  # UniqueCameraModel
-        50713: (SHORT, (1, 1)),  # BlackLevelRepeatDim
         50721: (containers.SRATIONAL, np.ravel(color_matrix).tolist()),  # ColorMatrix1
         50728: (containers.RATIONAL, np.ravel(as_shot_neutral).tolist()),
         50730: (containers.SRATIONAL, baseline_exposure),

@@ -42,7 +42,6 @@ from lensmodel.lens import read_profile
 from lensmodel.model import LensModel
 from lensmodel.neural.network import FieldNetwork
 from lensmodel.patches import Patch
-from lensmodel.patches.select import Rejection
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.photo.metadata import find_location
 from lensmodel.report.lens_report import lens_report
@@ -125,15 +124,8 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
         estimator=arguments["estimator"],
         on_step=progress,
     )
-    patches = [
-        {**_window(patch, patch.position), "score": patch.score, "cell": patch.cell}
-        for patch in selection.patches
-    ]
-    rejected = []
-    for window in selection.rejected:
-        centre = (window.row + (window.size - 1) / 2, window.col + (window.size - 1) / 2)
-        place = _window(window, developed.frame.position(*centre))
-        rejected.append({**place, "reason": window.reason})
+    patches = [{**_window(patch), "score": patch.score, "cell": patch.cell} for patch in selection.patches]
+    rejected = [{**_window(patch), "reason": patch.reason} for patch in selection.rejected]
     return {"patches": patches, "rejected": rejected, "lateral": to_json(_lateral(developed))}
 
 
@@ -282,9 +274,9 @@ TASKS: Final[Mapping[str, Task]] = {task.__name__.replace("_", "-"): task for ta
 FieldNetwork.load()  # in the fork server: a confined child may no longer read the weights, which all share
 
 
-def _window(window: Patch | Rejection, place: FieldPosition) -> dict[str, Any]:
-    square = {"row": window.row, "col": window.col, "size": window.size}
-    return {**square, "r": place.r, "phi": place.phi}
+def _window(patch: Patch) -> dict[str, Any]:
+    square = {"row": patch.row, "col": patch.col, "size": patch.size}
+    return {**square, "r": patch.position.r, "phi": patch.position.phi}
 
 
 def thumbnail(path: Path, kind: str, orientation: int) -> bytes:

@@ -73,7 +73,7 @@ def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[La
     corners = zip(part.rows, part.cols, strict=True)
     patches = [np.ascontiguousarray(plane[r : r + SIZE, c : c + SIZE]) for r, c in corners]
     looked = details_of(plane, part, 1.0)
-    features, r_map = features_of(part, looked), RMapSelector().score(part, looked)
+    features, r_map = features_of(looked), RMapSelector().score(looked)
     for own, score, patch in zip(features, r_map, patches, strict=True):
         try:
             found = np.asarray(estimator.estimate([patch], [noise], size=31).kernel)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, Frame, NoiseModel, Plane, StepHook, ignore_step, zone_of
-from lensmodel.patches.windows import BLOCKS_A_SIDE, Details, Windows, details_of, windows_of
+from lensmodel.patches.windows import BLOCKS_A_SIDE, Windows, details_of, windows_of
 from lensmodel.photo.values import LinearPhoto
 
 logger = logging.getLogger(__name__)
@@ -46,24 +46,15 @@ SHORTLIST_A_SECTOR: Final = 8  # windows that the costlier scores look at: sever
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A window of a photo that tells about the PSF."""
+    """A window of a photo that tells about the PSF, or one that was not taken."""
 
     row: int  # top-left pixel
     col: int
     size: int  # side in pixels
     position: FieldPosition  # of the window's centre
-    score: float  # how much it tells, 0 to 1
-    cell: int  # number of the field cell; patches of one cell may share one kernel
-
-
-@dataclass(frozen=True, slots=True)
-class Rejection:
-    """A window that was not taken, and why."""
-
-    row: int
-    col: int
-    size: int
-    reason: Reason
+    score: float = 0.0  # how much it tells, 0 to 1
+    cell: int = 0  # number of the field cell; patches of one cell may share one kernel
+    reason: Reason | None = None  # why it was not taken
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,16 +63,16 @@ class Selection:
 
     patches: tuple[Patch, ...]  # ordered by cell, the best of each cell first
     # at most `MAX_REJECTIONS` of them, spread evenly over the photo and the reasons
-    rejected: tuple[Rejection, ...]
+    rejected: tuple[Patch, ...]
 
 
 class Selector(Protocol):
     """Says how much each window tells about the PSF (Hirsch and Schölkopf, ICCV 2015, section 5.2)."""
 
-    def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
+    def score(self, windows: Windows) -> NDArray[np.float64]:
         """Score the n windows of a photo, shape (n,), 0..1: higher tells more.
 
-        `windows` tells where they lie, their edges, noise and clipping, `looked` their spectra.
+        `windows` tells where they lie, their edges, noise, clipping and spectra.
         """
 
 
@@ -98,9 +89,9 @@ class RMapSelector:
         score = ( log10 e_(2) + mean log10 max(S/N, 1) ) / 8
     """
 
-    def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
+    def score(self, windows: Windows) -> NDArray[np.float64]:
         """Return one score a window; see `lensmodel.Selector`."""
-        information = np.maximum(looked.information, 0.0).mean(axis=(1, 2)) / np.log(10.0)
+        information = np.maximum(windows.information, 0.0).mean(axis=(1, 2)) / np.log(10.0)
         return np.clip((edge_score(windows) + information) / 8.0, 0.0, 1.0)
 
 
@@ -114,7 +105,7 @@ MODEL: Final = Path(__file__).parent / "data" / "good_regions.npz"
 FEATURES: Final = 27  # columns that `features_of` makes
 
 
-def features_of(windows: Windows, looked: Details) -> NDArray[np.float64]:
+def features_of(windows: Windows) -> NDArray[np.float64]:
     """What a window looks like, in numbers, `(n, FEATURES)`, always finite.
 
     Directions are sorted by energy, so that a turned window has the same features. Energies and
@@ -124,7 +115,7 @@ def features_of(windows: Windows, looked: Details) -> NDArray[np.float64]:
     def log(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.log10(np.maximum(values, 1e-3))
 
-    bands = looked.information / np.log(10.0)
+    bands = windows.information / np.log(10.0)
     by_band = np.stack([bands.mean(axis=2), bands.min(axis=2), bands.max(axis=2), bands.std(axis=2)], axis=2)
     columns = [
         log(np.sort(windows.directions, axis=1)).T,
@@ -156,10 +147,10 @@ class GoodRegionsSelector:
     blur instead of camera shake, the statistics that the r-map selector also uses.
     """
 
-    def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
+    def score(self, windows: Windows) -> NDArray[np.float64]:
         """Return one score a window; see `Selector`."""
         weights, offset = learned()
-        return np.clip(1.0 - np.exp(features_of(windows, looked) @ weights + offset), 0.0, 1.0)
+        return np.clip(1.0 - np.exp(features_of(windows) @ weights + offset), 0.0, 1.0)
 
 
 selectors: Registry[Selector] = Registry(
@@ -192,32 +183,30 @@ def select(
     usable = np.flatnonzero(reasons == "")
     short = usable[_shortlist(windows.take(usable))]
     reasons[usable] = "duplicate"
-    if short.size:
-        looked = details_of(plane, windows.take(short), clip, coarse_noise)
-        flat = looked.evidence < EVIDENCE_FLOOR
-        one_directional = looked.information[:, 0].min(axis=1) < SECTOR_INFORMATION
-        reasons[short] = np.select([flat, one_directional], ["flat", "one-directional"], default="")
-        looked = Details(*(part[reasons[short] == ""] for part in looked))
-        short = short[reasons[short] == ""]
-    if not short.size:
+    looked = details_of(plane, windows.take(short), clip, coarse_noise)
+    flat = looked.evidence < EVIDENCE_FLOOR
+    one_directional = looked.information[:, 0].min(axis=1) < SECTOR_INFORMATION
+    reasons[short] = np.select([flat, one_directional], ["flat", "one-directional"], default="")
+    good = np.flatnonzero(reasons[short] == "")
+    if not good.size:
         raise _nothing_usable(reasons.tolist())
-    score = chooser.score(windows.take(short), looked)
+    score = chooser.score(looked.take(good)) * (JPEG_WEIGHT if jpeg else 1.0)
     order = np.argsort(-score, kind="stable")
-    short, score = short[order], score[order] * (JPEG_WEIGHT if jpeg else 1.0)
+    short, score, looked = short[good[order]], score[order], looked.take(good[order])
     reasons[short] = "duplicate"
-    patches = []
-    for number, cell in enumerate(_spread(windows.take(short), count)):
-        for i, told in zip(short[cell], score[cell], strict=True):
-            position = FieldPosition(min(float(windows.r[i]), 1.0), float(windows.phi[i]))
-            corner = int(windows.rows[i]), int(windows.cols[i])
-            patches.append(Patch(*corner, windows.size, position, float(told), number))
-            reasons[i] = ""
+
+    def patch(i: int, told: float = 0.0, cell: int = 0, reason: Reason | None = None) -> Patch:
+        position = FieldPosition(min(float(windows.r[i]), 1.0), float(windows.phi[i]))
+        corner = int(windows.rows[i]), int(windows.cols[i])
+        return Patch(*corner, windows.size, position, float(told), cell, reason)
+
+    patches: list[Patch] = []
+    for number, cell in enumerate(_spread(looked, count)):
+        patches += [patch(i, told, number) for i, told in zip(short[cell], score[cell], strict=True)]
+        reasons[short[cell]] = ""
     left = np.flatnonzero(reasons != "")
     logger.info("chose %d of %d windows; rejected: %s", len(patches), len(windows), Counter(reasons[left]))
-    rejected = [
-        Rejection(int(windows.rows[i]), int(windows.cols[i]), windows.size, reasons[i])
-        for i in left[:: left.size // MAX_REJECTIONS + 1]
-    ]
+    rejected = [patch(i, reason=reasons[i]) for i in left[:: left.size // MAX_REJECTIONS + 1]]
     return Selection(tuple(patches), tuple(rejected))
 
 
@@ -353,7 +342,7 @@ def spread_evenly(developed: LinearPhoto, *, count: int, size: int) -> Selection
     _require_room(frame, size)
     ratio, clipped = _blocks(developed)
     patches: list[Patch] = []
-    rejected: list[Rejection] = []
+    rejected: list[Patch] = []
     for rows, cols in _cells(frame, count, size):
         looked: list[tuple[bool, float, tuple[int, int], Reason]] = []
         for top, left in itertools.product(rows, cols):
@@ -364,13 +353,13 @@ def spread_evenly(developed: LinearPhoto, *, count: int, size: int) -> Selection
             usable = not full and float(ratio[part].mean()) >= _SIGNAL
             looked.append((usable, score, (top, left), "clipped" if full else "flat"))
         usable, score, (top, left), reason = max(looked)
+        position = frame.position(top + (size - 1) / 2.0, left + (size - 1) / 2.0)
         if usable:
-            position = frame.position(top + (size - 1) / 2.0, left + (size - 1) / 2.0)
-            patches.append(Patch(top, left, size, position, min(score / 3.0, 1.0), 0))
+            patches.append(Patch(top, left, size, position, min(score / 3.0, 1.0)))
         else:
-            rejected.append(Rejection(top, left, size, reason))
+            rejected.append(Patch(top, left, size, position, reason=reason))
     if not patches:
-        raise _nothing_usable(rejection.reason for rejection in rejected)
+        raise _nothing_usable(str(patch.reason) for patch in rejected)
     return Selection(tuple(patches), tuple(rejected))
 
 

@@ -7,8 +7,8 @@ spectra of a few are then looked at by themselves (`details_of`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -86,6 +86,9 @@ BLOCKS_A_SIDE: Final = 4  # of a window, which starts at any: finer starts find 
 EDGE_SIGMAS: Final = 4.0  # of a gradient's noise: above, a pixel is an edge (one of 3000 by chance)
 CLIP_SHARE: Final = 0.98  # noise and demosaicing leave clipped pixels a little below the level (chosen)
 DARK_SNR: Final = 5.0  # level over noise below which a pixel is dark: ten is half a photo of 1 % noise
+SECTORS: Final = 8  # of 22.5 degrees: a line lies in one or two
+BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)  # cycles/pixel (chosen): coarse, middle and fine detail
+BANDS: Final = len(BAND_EDGES) - 1  # the intervals between them
 SLOPE_ORDER: Final = 2  # of the polynomial that is taken off first: a sky or shading is no detail
 
 _MARGIN = 18  # half an r-map window and the smoothing
@@ -112,6 +115,11 @@ class Windows:
     # (n,), shares of the pixels above `CLIP_SHARE` and below `DARK_SNR`
     clipped: NDArray[np.float64]
     dark: NDArray[np.float64]
+    # what `details_of` finds: (n, BANDS, SECTORS), natural logarithm of mean power over noise
+    information: NDArray[np.float64]
+    # (n,), bits a frequency, log2(1 + signal / noise), in the bands that blur takes away, all but the first;
+    # 0 for noise: C. E. Shannon, "Communication in the presence of noise", Proc. IRE 37, 1949
+    evidence: NDArray[np.float64]
 
     def __len__(self) -> int:
         return int(self.rows.size)
@@ -168,6 +176,8 @@ def windows_of(plane: Plane, noise: NoiseModel, side: int, clip: float, on_step:
         sigma=np.sqrt(noise_variance),
         clipped=sums["clipped"] / area,
         dark=sums["dark"] / area,
+        information=np.zeros((tops.size, BANDS, SECTORS)),
+        evidence=np.zeros(tops.size),
     )
 
 
@@ -246,23 +256,11 @@ def _polynomials(size: int) -> NDArray[np.float64]:
 
 # --- the second look -----------------------------------------------------------------------------
 
-SECTORS: Final = 8  # of 22.5 degrees: a line lies in one or two
-BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)  # cycles/pixel (chosen): coarse, middle and fine detail
-BANDS: Final = len(BAND_EDGES) - 1  # the intervals between them
 NON_UNIFORMITY: Final = 0.005  # relative deviation of the gain of pixels: 0.3 to 1 percent by EMVA 1288
 DYNAMIC_RANGE: Final = 2.0**14.8  # of the best sensors: less noise was eaten by rounding or denoising
 
 
-class Details(NamedTuple):
-    """Second look at some windows; every array has one entry a window along axis 0."""
-
-    information: NDArray[np.float64]  # (n, BANDS, SECTORS), natural logarithm of mean power over noise
-    # (n,), bits a frequency, log2(1 + signal / noise), in the bands that blur takes away, all but the first;
-    # 0 for noise: C. E. Shannon, "Communication in the presence of noise", Proc. IRE 37, 1949
-    evidence: NDArray[np.float64]
-
-
-def details_of(plane: Plane, windows: Windows, clip: float, coarse: NoiseModel | None = None) -> Details:
+def details_of(plane: Plane, windows: Windows, clip: float, coarse: NoiseModel | None = None) -> Windows:
     """Look at windows of a plane; `coarse` is the noise between 0.1 and 0.4 cycles/pixel where it is more."""
     size = windows.size
     slopes = np.linalg.qr(_polynomials(size).reshape(-1, size * size).T)[0]
@@ -275,7 +273,7 @@ def details_of(plane: Plane, windows: Windows, clip: float, coarse: NoiseModel |
     count = np.bincount(number, minlength=BANDS * SECTORS).reshape(BANDS, SECTORS)
     fine = np.square(windows.sigma)
     noise = fine if coarse is None else np.maximum(fine, coarse.variance(windows.level))
-    information, evidence = np.zeros((len(windows), BANDS, SECTORS)), np.zeros(len(windows))
+    information, evidence = windows.information.copy(), windows.evidence.copy()
     for i, corner in enumerate(zip(windows.rows.tolist(), windows.cols.tolist(), strict=True)):
         values = np.array(plane[corner[0] :, corner[1] :][:size, :size], dtype=np.float64)
         detrended = (values.ravel() - slopes @ (values.ravel() @ slopes)).reshape(values.shape)
@@ -285,7 +283,7 @@ def details_of(plane: Plane, windows: Windows, clip: float, coarse: NoiseModel |
         least = noise[i] + (NON_UNIFORMITY * values.mean()) ** 2 + (clip / DYNAMIC_RANGE) ** 2
         bits = np.log2(1.0 + np.maximum(mean[1:] / max(least, 1e-30) - 1.0, 0.0))
         evidence[i] = np.average(bits, weights=count[1:])
-    return Details(information, evidence)
+    return replace(windows, information=information, evidence=evidence)
 
 
 def periodogram(values: NDArray[np.floating]) -> NDArray[np.float64]:

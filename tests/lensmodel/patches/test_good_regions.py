@@ -7,7 +7,7 @@ from scipy import ndimage
 from lensmodel.core.types import NoiseModel, Plane, ignore_step
 from lensmodel.patches import Selector
 from lensmodel.patches.select import FEATURES, GoodRegionsSelector, RMapSelector, features_of
-from lensmodel.patches.windows import Details, Windows, details_of, windows_of
+from lensmodel.patches.windows import Windows, details_of, windows_of
 
 SIGMA = 0.004
 
@@ -24,34 +24,30 @@ def plane_of(seed: int, sigma: float = SIGMA) -> Plane:
     return (blurred + rng.normal(0.0, sigma, plane.shape)).astype(np.float32)
 
 
-def looked_at(plane: Plane, sigma: float = SIGMA) -> tuple[Windows, Details]:
+def looked_at(plane: Plane, sigma: float = SIGMA) -> Windows:
     windows = windows_of(plane, NoiseModel.white(sigma), 32, 1.0, ignore_step)
-    return windows, details_of(plane, windows, 1.0)
+    return details_of(plane, windows, 1.0)
 
 
 @pytest.fixture(scope="module")
-def windows_and_details() -> tuple[Windows, Details]:
+def looked() -> Windows:
     return looked_at(plane_of(0))
 
 
-def test_features_have_the_named_columns_and_are_finite_even_on_a_flat_plane(
-    windows_and_details: tuple[Windows, Details],
-) -> None:
+def test_features_have_the_named_columns_and_are_finite_even_on_a_flat_plane(looked: Windows) -> None:
     flat = looked_at(np.full((256, 256), 0.5, dtype=np.float32))
 
-    for windows, details in (windows_and_details, flat):
-        features = features_of(windows, details)
+    for windows in (looked, flat):
+        features = features_of(windows)
         assert features.shape == (len(windows), FEATURES)
         assert np.isfinite(features).all()
 
 
-def test_features_hardly_change_when_the_plane_is_turned(
-    windows_and_details: tuple[Windows, Details],
-) -> None:
+def test_features_hardly_change_when_the_plane_is_turned(looked: Windows) -> None:
     plane = plane_of(0)[:320, :320].copy()
-    straight = features_of(*looked_at(plane))
-    turned = features_of(*looked_at(np.rot90(plane).copy()))
-    spread = features_of(*windows_and_details).std(axis=0)
+    straight = features_of(looked_at(plane))
+    turned = features_of(looked_at(np.rot90(plane).copy()))
+    spread = features_of(looked).std(axis=0)
     order = np.rot90(np.arange(49).reshape(7, 7)).ravel()
     difference = np.abs(turned - straight[order])
 
@@ -62,4 +58,4 @@ def test_features_hardly_change_when_the_plane_is_turned(
 def test_windows_score_above_the_same_in_heavy_noise(selector: Selector) -> None:
     quiet, loud = (looked_at(plane_of(3, sigma=sigma), sigma) for sigma in (SIGMA, 10 * SIGMA))
 
-    assert selector.score(*quiet).mean() > selector.score(*loud).mean() + 0.1
+    assert selector.score(quiet).mean() > selector.score(loud).mean() + 0.1

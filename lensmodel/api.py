@@ -104,10 +104,9 @@ def calibrate(
 
     Raises
     ------
-    FileNotFoundError
-        If one of the files is not there; nothing is begun then.
-    InvalidInputError
-        If a value is out of its range, both `lens` and `model` are given, or no method has that name.
+    FileNotFoundError, InvalidInputError
+        Before anything is begun, if one of the files is not there, a value is out of its range, both `lens`
+        and `model` are given, or no method has that name.
     NotEnoughEvidenceError
         If no photo could be used; the text says why for each.
     """
@@ -321,9 +320,7 @@ def correct(
     file_format : {"tiff16", "tiff32", "png16", "png8", "jpeg", "dng"}, optional
         By default what the ending of `output` says, and for a TIFF of floating-point numbers the same again.
     color_space : {"same", "srgb", "camera-linear"}
-        Colors of the written file.
-    quality : int
-        Of a JPEG, 1..100.
+        Colors of the written file; `quality` is that of a JPEG, 1..100.
     least_gain_db : float, optional
         Write nothing where a lesser gain is expected (`Corrected.expected_gain_db`); None always writes.
     workers : int, optional
@@ -339,10 +336,8 @@ def correct(
 
     Raises
     ------
-    OSError
-        If photo or profile cannot be read, or `output` not be written.
-    UnreadablePhotoError, ImageTooLargeError
-        If the file cannot be decoded, or has more pixels than are read.
+    OSError, UnreadablePhotoError, ImageTooLargeError
+        If a file cannot be read or written, not be decoded, or has more pixels than are read.
     InvalidInputError
         If a value is out of its range, the ending of `output` is unknown, it is the photo itself, or no
         method has that name.

@@ -71,10 +71,8 @@ class Lens:
     ----------
     model : LensModel
         The function behind the answers.
-    names : mapping of str
-        What is known of maker, model, serial and label.
-    photos : mapping of str
-        File names by the id that samples carry.
+    names, photos : mapping of str
+        What is known of maker, model, serial and label; and file names by the id that samples carry.
     cameras : tuple of Camera
         What the photos were taken with, each once; empty where none says.
     """
@@ -85,10 +83,7 @@ class Lens:
     cameras: tuple[Camera, ...] = ()
 
     def __repr__(self) -> str:
-        apertures = sorted({s.settings.aperture for s in self.samples if s.settings.aperture is not None})
-        span = "" if not apertures else f", f/{apertures[0]:g}"
-        span += f" to f/{apertures[-1]:g}" if len(apertures) > 1 else ""
-        return f"<Lens: {self.description}, {len(self.samples)} samples{span}>"
+        return f"<Lens: {self.description}, {len(self.samples)} samples>"
 
     @classmethod
     def from_kernels(
@@ -127,15 +122,9 @@ class Lens:
         stack = np.asarray(kernels, dtype=np.float64)
         if stack.ndim != 3:
             raise InvalidInputError(f"kernels must have the shape (n, k, k), got {stack.shape}")
-        given = {
-            "r": r,
-            "phi": phi,
-            "aperture": aperture,
-            "channel": channel,
-            "weight": weight,
-            "photo": photo,
-        }
-        columns = [_each(values, len(stack), name) for name, values in given.items()]
+        names = ("r", "phi", "aperture", "channel", "weight", "photo")
+        given = (r, phi, aperture, channel, weight, photo)
+        columns = [_each(values, len(stack), name) for name, values in zip(names, given, strict=True)]
         common: dict[str, Any] = {"pixel_pitch_um": pixel_pitch_um, "estimator": "given"}
         samples = [
             PsfSample(centred(kernel), FieldPosition(*at), LensSettings(n, channel=c), w, name, **common)
@@ -159,7 +148,7 @@ class Lens:
     def psf(
         self, r: float, phi: float = 0.0, *, size: int = DEFAULT_SIZE, **settings: Unpack[Settings]
     ) -> PsfAnswer:
-        """Return the PSF at one place, with how much stands behind it.
+        """Return the PSF at one place, with how much stands behind it; warns if no photo shows the place.
 
         Parameters
         ----------
@@ -170,11 +159,6 @@ class Lens:
         **settings
             `aperture`, the f-number, where None takes all apertures of the samples together; the same goes
             for `focal_mm` in mm and `focus_m` in metres. `channel`, "r", "g" (default) or "b".
-
-        Warns
-        -----
-        UserWarning
-            If no photo shows this place at these settings.
         """
         answer = self.model.query(FieldPosition(r, phi), LensSettings(**settings), size)
         if answer.extrapolated:
@@ -188,11 +172,9 @@ class Lens:
     def kernels(
         self, r: ArrayLike, phi: ArrayLike, *, size: int = DEFAULT_SIZE, **settings: Unpack[Settings]
     ) -> NDArray[np.float64]:
-        """Return the kernels of `psf` at many places, `r` and `phi` of shapes that broadcast to one shape S.
+        """Return the kernels of `psf` at many places, float64 of shape (*S, size, size).
 
-        Returns
-        -------
-        ndarray of float64, shape (*S, size, size)
+        `r` and `phi` have shapes that broadcast to one shape S.
         """
         radii, angles = np.broadcast_arrays(np.asarray(r, np.float64), np.asarray(phi, np.float64))
         places = [FieldPosition(*at) for at in zip(radii.flat, angles.flat, strict=True)]
@@ -204,17 +186,8 @@ class Lens:
     ) -> NDArray[np.float64]:
         """Return the contrast that the lens leaves of fine lines (`mtf_from_kernel` gives the equation).
 
-        Parameters
-        ----------
-        r, phi, **settings
-            As of `kernels`.
-        frequencies : array_like of float, shape (n,) or ()
-            Cycles/pixel; not negative.
-
-        Returns
-        -------
-        ndarray of float64, shape (2, *S, n)
-            Tangential (contrast along the radius), then sagittal; 1 at frequency 0.
+        `r`, `phi` and settings are as of `kernels`, `frequencies` (n,) or () in cycles/pixel, not negative.
+        The answer, float64 of shape (2, *S, n), is tangential (contrast along the radius), then sagittal.
         """
         wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
         if wanted.ndim != 1 or not (np.isfinite(wanted) & (wanted >= 0.0)).all():
@@ -229,14 +202,11 @@ class Lens:
     ) -> NDArray[np.float64]:
         """Return where contrast falls to one half, at the centres of the cells of `field_grid`.
 
-        Returns
-        -------
-        ndarray of float64, shape (2, rows, cols)
-            Tangential and sagittal MTF50 in cycles/pixel; row 0 is the top in sensor orientation.
+        The answer, float64 of shape (2, rows, cols), is the tangential and sagittal MTF50 in cycles/pixel;
+        row 0 is the top in sensor orientation.
         """
         r, phi = field_grid(rows, cols, aspect=aspect)
-        kernels = self.kernels(r, phi, **settings)
-        return _both_ways(kernels, phi, mtf50_from_kernel)
+        return _both_ways(self.kernels(r, phi, **settings), phi, mtf50_from_kernel)
 
     @property
     def samples(self) -> tuple[PsfSample, ...]:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -35,6 +35,7 @@ from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEv
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Kernel, NoiseModel, block_means
 
+Array: TypeAlias = NDArray[np.float64]
 Box = tuple[int, int, int, int]
 """(row, col, height, width) in pixels of the frame."""
 
@@ -53,15 +54,15 @@ _MIN_STEP_OVER_NOISE: Final = 3.0  # standard deviations: weaker steps are noise
 class EdgeResponse:
     """What one slanted edge says about the sharpness across it."""
 
-    frequencies: NDArray[np.float64]  # (n,), cycles/pixel along the normal of the edge, 0 to 1
-    mtf: NDArray[np.float64]  # (n,), contrast, 1 at zero frequency
+    frequencies: Array  # (n,), cycles/pixel along the normal of the edge, 0 to 1
+    mtf: Array  # (n,), contrast, 1 at zero frequency
     mtf50: float  # lowest frequency where the contrast falls to a half; 1.0 where it does not fall so far
     overshoot: float  # how far the edge profile leaves its bright or its dark level, in percent of the step
     normal: float  # angle of the normal from dark to bright, radians, counter-clockwise from the right
     offset: float  # pixels along the normal from the middle of the crop to the edge
     step: float  # bright minus dark level
-    esf_distance: NDArray[np.float64]  # (m,), edge profile: distance in pixels, dark to bright, and level
-    esf: NDArray[np.float64]
+    esf_distance: Array  # (m,), edge profile: distance in pixels, dark to bright, and level
+    esf: Array
 
     @property
     def angle_deg(self) -> float:
@@ -81,7 +82,7 @@ def crossing(frequencies: ArrayLike, contrast: ArrayLike, level: float) -> float
     return float(f[i - 1] + share * (f[i] - f[i - 1]))
 
 
-def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: float) -> NDArray[np.float64]:
+def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: float) -> Array:
     """Share of each unit pixel on the bright side of an edge through the origin.
 
     A square seen along the normal is a trapezoid, the box of width a = |cos| convolved with that
@@ -96,7 +97,7 @@ def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: fl
         return np.clip(distance + 0.5, 0.0, 1.0)
     p, m = (a + b) / 2.0, abs(a - b) / 2.0
 
-    def squared(x: NDArray[np.floating]) -> NDArray[np.float64]:
+    def squared(x: NDArray[np.floating]) -> Array:
         return np.square(np.maximum(x, 0.0))
 
     area = squared(distance + p) - squared(distance + m) - squared(distance - m) + squared(distance - p)
@@ -143,7 +144,7 @@ def slanted_edge(plane: NDArray[np.floating], measured: NDArray[np.bool_] | None
     )
 
 
-def _edge_line(crop: NDArray[np.float64]) -> tuple[float, float, float]:
+def _edge_line(crop: Array) -> tuple[float, float, float]:
     """Line c(row) = intercept + slope row of a near-vertical edge; and +1 if bright is on the right."""
     rows, cols = crop.shape
     derivative = (crop[:, 2:] - crop[:, :-2]) / 2.0
@@ -178,16 +179,14 @@ def _edge_line(crop: NDArray[np.float64]) -> tuple[float, float, float]:
     return float(intercept), float(slope), sign
 
 
-def _robust_line(y: NDArray[np.float64], x: NDArray[np.float64]) -> tuple[float, float]:
+def _robust_line(y: Array, x: Array) -> tuple[float, float]:
     """Line through points with outliers: median of the slopes of far pairs (Theil and Sen)."""
     half = y.size // 2
     slope = float(np.median((x[half:] - x[: x.size - half]) / (y[half:] - y[: y.size - half])))
     return float(np.median(x - slope * y)), slope
 
 
-def _profile(
-    distance: NDArray[np.float64], crop: NDArray[np.float64], used: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _profile(distance: Array, crop: Array, used: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Mean level in bins of a quarter pixel of the distance, as far as both sides are well filled."""
     bins = np.floor(distance * OVERSAMPLING + 0.5).astype(np.intp)
     limit = round(_REACH * OVERSAMPLING)
@@ -220,13 +219,13 @@ def _profile(
     return position, esf
 
 
-def _levels(position: NDArray[np.float64], esf: NDArray[np.float64]) -> tuple[float, float]:
+def _levels(position: Array, esf: Array) -> tuple[float, float]:
     """Dark and bright level: mean over the outer third of each side."""
     outer = np.abs(position) > 2.0 / 3.0 * position[-1]
     return float(esf[outer & (position < 0)].mean()), float(esf[outer & (position > 0)].mean())
 
 
-def _spectrum(esf: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _spectrum(esf: Array) -> tuple[Array, Array]:
     """MTF of an edge profile on frequencies from 0 to 1 cycles/pixel."""
     lsf = (esf[2:] - esf[:-2]) / 2.0
     t = np.arange(lsf.size)
@@ -239,7 +238,7 @@ def _spectrum(esf: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
     return frequencies, mtf
 
 
-def mtf_from_kernel(kernel: Kernel, angle: float, frequencies: ArrayLike) -> NDArray[np.float64]:
+def mtf_from_kernel(kernel: Kernel, angle: float, frequencies: ArrayLike) -> Array:
     """Contrast that a kernel leaves of waves whose normal has an angle, by frequency in cycles/pixel.
 
     It is the modulus of the transfer function along a line::
@@ -255,7 +254,7 @@ def mtf_from_kernel(kernel: Kernel, angle: float, frequencies: ArrayLike) -> NDA
     return np.abs(np.einsum("fc,fc->f", along_rows @ k, along_cols))
 
 
-def _waves(frequencies: NDArray[np.float64], side: int) -> NDArray[np.complex128]:
+def _waves(frequencies: Array, side: int) -> NDArray[np.complex128]:
     """exp(2 pi i f t) at each pixel t of a side, 0 in the middle; one half is the conjugate of the other."""
     upward = np.exp(2j * np.pi * np.outer(frequencies, np.arange(1, side // 2 + 1)))
     return np.concatenate([upward[:, ::-1].conj(), np.ones((frequencies.size, 1)), upward], axis=1)
@@ -298,7 +297,7 @@ class FoundEdge:
 
     box: Box  # (row, col, height, width) of the window in its middle that was measured
     response: EdgeResponse  # what was measured there
-    ends: NDArray[np.float64]  # (2, 2): row, col of both ends as seen; corners lie half a window further out
+    ends: Array  # (2, 2): row, col of both ends as seen; corners lie half a window further out
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -332,9 +331,7 @@ def find_edges(
     return edges if chart else ()
 
 
-def _edge_on(
-    plane: NDArray[np.floating], ends: NDArray[np.float64], noise: NoiseModel, clip: float
-) -> FoundEdge | None:
+def _edge_on(plane: NDArray[np.floating], ends: Array, noise: NoiseModel, clip: float) -> FoundEdge | None:
     """Measure an edge between two ends in its middle, or beside it where the middle is spoilt."""
     for share in (0.5, 0.25, 0.75):
         for side in SIDES:
@@ -347,7 +344,7 @@ def _edge_on(
     return None
 
 
-def _segments(means: NDArray[np.float32]) -> list[NDArray[np.float64]]:
+def _segments(means: NDArray[np.float32]) -> list[Array]:
     """Ends of edges, as runs of windows that each hold one straight edge and no more, strongest first.
 
     Where the squared gradients of a window have their centre of mass its edge passes, and they scatter little
@@ -382,7 +379,7 @@ def _segments(means: NDArray[np.float32]) -> list[NDArray[np.float64]]:
     middles = np.stack([middle_y + 0.5 + offset * sin, middle_x + 0.5 + offset * cos], axis=-1) * _MEAN
     rises = cos * _sums(across) + sin * _sums(down) >= 0.0
     upright = np.abs(cos) > math.sqrt(0.5)
-    found: list[tuple[float, NDArray[np.float64]]] = []
+    found: list[tuple[float, Array]] = []
     for kind in (upright & rises, upright & ~rises, ~upright & rises, ~upright & ~rises):
         labels, _ = ndimage.label(kind & kept, structure=np.ones((3, 3)))
         for number, where in enumerate(ndimage.find_objects(labels), start=1):
@@ -391,7 +388,7 @@ def _segments(means: NDArray[np.float32]) -> list[NDArray[np.float64]]:
     return [ends for _, ends in sorted(found, key=lambda pair: -pair[0])]
 
 
-def _ends(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ends(points: Array) -> Array:
     """Ends of the line through the middles of windows along one edge."""
     center = points.mean(axis=0)
     along = np.linalg.svd(points - center)[2][0] if len(points) > 1 else np.array([1.0, 0.0])
@@ -399,7 +396,7 @@ def _ends(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return center + np.array([[place.min()], [place.max()]]) * along
 
 
-def _sums(plane: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sums(plane: Array) -> Array:
     """Sums over windows, a quarter of a window apart."""
     blocks = _STRIDE**2 * block_means(plane, _STRIDE)
     return sliding_window_view(blocks, (_WINDOW // _STRIDE,) * 2).sum(axis=(2, 3))
@@ -419,7 +416,7 @@ def _edge_of(window: NDArray[np.floating], noise: NoiseModel, clip: float) -> Ed
     return response if _holds_nothing_else(crop, response, noise) else None
 
 
-def _holds_nothing_else(crop: NDArray[np.float64], response: EdgeResponse, noise: NoiseModel) -> bool:
+def _holds_nothing_else(crop: Array, response: EdgeResponse, noise: NoiseModel) -> bool:
     """Whether an edge stands out, leans, is no wider than a third of its window, and explains it."""
     step, esf = response.step, response.esf
     known = (response.mtf50, response.overshoot, step, response.normal)
@@ -443,7 +440,7 @@ def _holds_nothing_else(crop: NDArray[np.float64], response: EdgeResponse, noise
     )
 
 
-def _unexplained(crop: NDArray[np.float64], normal: float) -> NDArray[np.float64]:
+def _unexplained(crop: Array, normal: float) -> Array:
     """What is left of a window after its mean profile along the normal."""
     rows, cols = np.indices(crop.shape)
     distance = cols * math.cos(normal) - rows * math.sin(normal)

@@ -14,7 +14,7 @@ from lensmodel.core.files import to_json, write_atomically
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.types import LensSettings
 from lensmodel.report.export import EXPORTERS, psf_grid, to_csv
-from lensmodel.report.lens_report import LensReport, compare, filled_aspect, lens_report, provenance, widest
+from lensmodel.report.lens_report import LensReport, compare, lens_report, provenance, widest
 
 Aperture = Annotated[float | None, console.aperture("f-number; default: the widest that a photo had.")]
 
@@ -123,7 +123,6 @@ def export(
         model = files.profile_at(profile).model
         with files.as_usage():
             settings = widest(model) if aperture is None else LensSettings(aperture=aperture)
-        settings, aspect = settings.with_channel(channel), filled_aspect(model)
-        psfs = psf_grid(model, settings, rows=rows, cols=cols, size=size, aspect=aspect)
+        psfs = psf_grid(model, settings.with_channel(channel), rows=rows, cols=cols, size=size)
     write_atomically(output, EXPORTERS[file_format](psfs))
     shown.result(str(output))

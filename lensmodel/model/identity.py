@@ -64,14 +64,10 @@ class Identity:
 def difference(lens: Identity, other: Identity) -> str | None:
     """Say why a photo, or another lens, cannot be, or need not be, of a lens; None where nothing says so.
 
-    - What both name of the lens must agree.
-    - Where only the other names its lens, its camera recorded more than for the photos of the lens, so
-      nothing says that they are of one lens, unless the owner gave the lens a label. A lens of which nothing
-      at all is known may be any.
-    - Where one of them names no lens, its camera must be of a model that both were seen on: the lens of a
-      compact is part of it, and two models of camera have two lenses. On the same body an unnamed lens may be
-      any that was screwed on; its focal length tells that it was another one, but for compacts that zoom.
-    - Where none of them names its lens it may be part of the camera: the serials of both bodies must agree.
+    What both name of the lens must agree. Where only the other names its lens it is another one, unless the
+    owner labelled the lens, or nothing at all is known of it. Where one names none, both must have been seen
+    on one model of camera, of which a lens may be part, at about one focal length, but for compacts that
+    zoom; and where none does, on one body.
     """
     for name, (key, words) in _NAMED.items():
         ours, theirs = lens.names.get(name), other.names.get(name)

@@ -9,14 +9,13 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone, zone_of
 from lensmodel.model import camera_bodies
 from lensmodel.model.learned_field import LearnedField
-from lensmodel.model.query import FAR, MODES, PAPER, PsfAnswer
+from lensmodel.model.query import FAR, MODES, PAPER, Array, PsfAnswer
 from lensmodel.model.regression import Regression
 
 _LEAST_ERROR: Final = 0.01  # relative L2 below which no part of an answer is believed (chosen)
@@ -102,7 +101,7 @@ class LensModel:
         size: int = 55,
         *,
         pitch_um: float | None = None,
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """Return the kernels of `query` of many places, (n, size, size); a regression alone is faster."""
         pitch_um = self._asked(size, pitch_um)
         if not positions:

@@ -1,6 +1,4 @@
-"""Questions to a lens model and its answers: variables, distances between their values, bandwidths.
-
-The variables are those that a PSF depends on besides (u, v).
+"""Questions to a lens model and its answers: the variables besides (u, v), distances, bandwidths.
 
 By the one distance the regression weighs samples (paper, eq. 7), in bandwidths::
 
@@ -36,13 +34,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, Kernel, LensSettings
+
+Array: TypeAlias = NDArray[np.float64]
 
 # of x, y, stops, octaves and dioptres (chosen: kernels of usual lenses differ by 0.1 to 0.2 over each)
 UNITS: Final = np.array([0.2, 0.2, 1.0, 0.5, 0.5])
@@ -57,22 +57,12 @@ MODES: Final = ("default", PAPER)  # ways to answer from samples, see `LensModel
 class PsfAnswer:
     """A PSF with what stands behind it.
 
-    Parameters
-    ----------
-    kernel : Kernel, float64, shape (size, size)
-        In the image frame, centred, sum 1.
-    predicted_error : float
-        Expected relative L2 of the kernel, 0..1.
-    effective_samples : float
-        1 / sum W^2 of the samples' weights W in the answer, of sum 1.
-    photos : int
-        Photos of these samples.
-    extrapolated : bool
-        Whether no sample is near the question in place and settings.
-    weights : str
-        Fingerprint of the network's weights; empty where no network took part.
-    ring_error : ndarray of float64, shape (8,), or None
-        Expected r.m.s. error of the transfer function in rings of frequency; None but of the network alone.
+    `kernel`, float64 of shape (size, size), is in the image frame, centred, of sum 1; `predicted_error` its
+    expected relative L2, 0..1. `effective_samples` is 1 / sum W^2 of the samples' weights W in the answer, of
+    sum 1, `photos` the number of their photos, and `extrapolated` whether none is near the question in place
+    and settings. `weights` is the fingerprint of the network's weights, empty where none took part, and
+    `ring_error`, shape (8,), the expected r.m.s. error of the transfer function in rings of frequency; None
+    but of the network alone.
     """
 
     kernel: Kernel
@@ -81,7 +71,7 @@ class PsfAnswer:
     photos: int
     extrapolated: bool
     weights: str = ""
-    ring_error: NDArray[np.float64] | None = None
+    ring_error: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,16 +80,16 @@ class Part:
 
     kernel: Kernel
     error: float  # expected relative L2
-    weights: NDArray[np.float64]  # (n,), of the samples in the answer, of sum 1
+    weights: Array  # (n,), of the samples in the answer, of sum 1
     photos: NDArray[np.str_]  # (n,), of these samples
     nearest: float  # distance of the nearest of them, in units
-    ring_error: NDArray[np.float64] | None = None
+    ring_error: Array | None = None
 
 
 # --- places and settings -------------------------------------------------------------------------
 
 
-def point(position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:
+def point(position: FieldPosition, settings: LensSettings) -> Array:
     """Coordinates of a place and settings, shape (7,); NaN = unknown.
 
     They are r, phi as cosine and sine, stops, wavelength in nm, octaves of focal length, dioptres.
@@ -112,31 +102,29 @@ def point(position: FieldPosition, settings: LensSettings) -> NDArray[np.float64
     return np.array([position.r, *turned, stops, wave, math.log2(focal), 1.0 / focus])
 
 
-def points(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
+def points(samples: Sequence[PsfSample]) -> Array:
     """Coordinates of samples, shape (n, 7)."""
     return np.array([point(s.position, s.settings) for s in samples])
 
 
-def vectors(where: NDArray[np.float64]) -> NDArray[np.float64]:
+def vectors(where: Array) -> Array:
     """(x, y) to the right and up, in half-diagonals, of points `(..., 7)`, shape (..., 2)."""
     r = where[..., :1]
     return np.asarray(where[..., 1:3] * (r / np.minimum(np.maximum(r, 1e-30) / _CENTER_R, 1.0)))
 
 
-def squared_distances(
-    where: NDArray[np.float64], asked: NDArray[np.float64], scale: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def squared_distances(where: Array, asked: Array, scale: Array) -> Array:
     """Squared distances in bandwidths of points `(n, 7)` from one point `(7,)`; unknowns drop out."""
     gap = np.nan_to_num((where - asked) / scale, copy=False)
     return np.asarray((gap * gap).sum(axis=-1))
 
 
-def in_units(where: NDArray[np.float64]) -> NDArray[np.float64]:
+def in_units(where: Array) -> Array:
     """Points `(..., 7)` in `UNITS`, shape (..., 5): x, y, stops, octaves, dioptres; NaN = unknown."""
     return np.concatenate([vectors(where), where[..., [3, 5, 6]]], axis=-1) / UNITS
 
 
-def nearest(where: NDArray[np.float64], asked: NDArray[np.float64]) -> float:
+def nearest(where: Array, asked: Array) -> float:
     """Distance from a point `(5,)` to the nearest of others `(n, 5)`; unknowns drop out."""
     return float(np.linalg.norm(np.nan_to_num(where - asked), axis=1).min())
 
@@ -171,9 +159,7 @@ def reference_bandwidth(sigma: float, dimensions: int, count: int) -> float:
     return sigma * (4.0 / ((dimensions + 2) * max(count, 1))) ** (1.0 / (dimensions + 4))
 
 
-def bandwidths(
-    where: NDArray[np.float64], mode: str, factors: tuple[float, float] = (1.0, 1.0)
-) -> NDArray[np.float64]:
+def bandwidths(where: Array, mode: str, factors: tuple[float, float] = (1.0, 1.0)) -> Array:
     """Bandwidths of the columns of points `(n, 7)` by eq. (8), and factors on r and phi.
 
     n counts PSF samples of one channel, not their pixels: a million pixels of one PSF say nothing
@@ -183,14 +169,10 @@ def bandwidths(
     known = {column: where[~np.isnan(where[:, column]), column] for column in (3, 5, 6)}
     varying = {c: float(values.std()) for c, values in known.items() if values.size and values.std() > _SAME}
     d = 2 + len(varying)
-    # the paper's own way is eq. (8) as it stands
-    whole = _PLACE_SHARE if mode == PAPER else 1.0
-    r, phi = (
-        max(_PLACE_SHARE * reference_bandwidth(sigma, d, n), floor) / whole
-        for sigma, floor in ((float(where[:, 0].std()), _FLOOR_R), (math.sqrt(0.5), _FLOOR_PHI))
-    )
+    share = 1.0 if mode == PAPER else _PLACE_SHARE  # the paper's own way is eq. (8) as it stands
     scale = _FALLBACK.copy()
-    scale[0], scale[1:3] = r * factors[0], phi * factors[1]
+    scale[0] = factors[0] * max(share * reference_bandwidth(float(where[:, 0].std()), d, n), _FLOOR_R)
+    scale[1:3] = factors[1] * max(share * reference_bandwidth(math.sqrt(0.5), d, n), _FLOOR_PHI)
     for column, sigma in varying.items():
         scale[column] = min(scale[column], reference_bandwidth(sigma, d, n))
     return scale
@@ -204,12 +186,7 @@ class HeldOut:
     """
 
     def __init__(
-        self,
-        rows: NDArray[np.floating],
-        where: NDArray[np.float64],
-        scale: NDArray[np.float64],
-        claims: NDArray[np.float64],
-        groups: NDArray[np.intp],
+        self, rows: NDArray[np.floating], where: Array, scale: Array, claims: Array, groups: NDArray[np.intp]
     ) -> None:
         rows = np.asarray(rows, dtype=np.float64)  # errors are small differences of these products
         gap = np.nan_to_num((where[:, None, :] - where[None, :, :]) / scale, nan=0.0) ** 2
@@ -218,9 +195,7 @@ class HeldOut:
         self._place, self._turn = gap[..., 0], gap[..., 1] + gap[..., 2]
         self._others = np.where(groups[:, None] == groups[None, :], np.inf, gap[..., 3:].sum(axis=-1))
 
-    def weights(
-        self, factors: tuple[float, float], trust: NDArray[np.float64] | float = 1.0
-    ) -> NDArray[np.float64]:
+    def weights(self, factors: tuple[float, float], trust: Array | float = 1.0) -> Array:
         """Held-out Nadaraya-Watson weights at multiples of the bandwidths in r and phi, rows of sum 1."""
         squared = self._place / factors[0] ** 2 + self._turn / factors[1] ** 2 + self._others
         nearest = squared.min(axis=1, keepdims=True)
@@ -228,13 +203,13 @@ class HeldOut:
         total = weight.sum(axis=1, keepdims=True)
         return np.asarray(weight / np.where(total > 0, total, 1.0))
 
-    def errors(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    def errors(self, weight: Array) -> Array:
         """Relative L2 of each sample against its weighted mean of others."""
         mean = weight @ self._gram
         squared = np.diag(self._gram) - 2 * np.diag(mean) + np.einsum("ij,ij->i", mean, weight)
         return np.where(weight.sum(axis=1) > 0, np.sqrt(np.maximum(squared, 0.0) / self._own), 1.0)
 
-    def noise(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    def noise(self, weight: Array) -> Array:
         """Squared relative scatter of each sample's others about their weighted mean.
 
         From the weights of `weights`: sum_j w_j |C_j - f|^2 / (1 - sum_j w_j^2), over the sample's |C_i|^2.
@@ -261,9 +236,7 @@ class HeldOut:
                 break
         return r, phi
 
-    def robust(
-        self, photos: NDArray[np.intp], factors: tuple[float, float]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def robust(self, photos: NDArray[np.intp], factors: tuple[float, float]) -> tuple[Array, Array, Array]:
         """Factors on the weights of samples and of photos (0 to the last), and the held-out errors."""
         count = int(photos.max()) + 1
         by_sample, by_photo = np.ones(photos.size), np.ones(count)
@@ -276,9 +249,7 @@ class HeldOut:
         return by_sample, by_photo, errors
 
 
-def _biweight(
-    values: NDArray[np.float64], reference: NDArray[np.float64], *, floor: float
-) -> NDArray[np.float64]:
+def _biweight(values: Array, reference: Array, *, floor: float) -> Array:
     """Tukey's weights by the median and the spread of a reference."""
     middle = float(np.median(reference))
     spread = 1.4826 * float(np.median(np.abs(reference - middle)))
@@ -290,10 +261,10 @@ def _biweight(
 def cross_validate(
     samples: Sequence[PsfSample],
     mode: str,
-    upright: Callable[[NDArray[np.intp]], NDArray[np.float64]],
-    where: NDArray[np.float64],
-    base: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
+    upright: Callable[[NDArray[np.intp]], Array],
+    where: Array,
+    base: Array,
+) -> tuple[Array, Array, Array, tuple[float, float]]:
     """Choose bandwidths by cross-validation, weigh samples robustly; `upright` gives the kernels of rows.
 
     Returns (n,) weights, held-out relative L2, and the part of its square that is the samples' own scatter;
@@ -302,7 +273,7 @@ def cross_validate(
     photo = np.unique([s.photo for s in samples], return_inverse=True)[1]
     groups, scale = _held_together(photo, where[:, 5]), bandwidths(where, mode)
     counting = np.flatnonzero(base > 0)
-    scored = _thinned(counting, _SCORED)
+    scored = thinned(counting, _SCORED)
     errors, noise = np.full(len(samples), _UNKNOWN_ERROR), np.zeros(len(samples))
     factors, weights = (1.0, 1.0), base.copy()
     if len(scored) < _FEWEST:
@@ -313,7 +284,7 @@ def cross_validate(
 
     if mode != PAPER and len(np.unique(photo[counting])) >= _CV_PHOTOS:
         green = counting[where[counting, 4] == WAVELENGTH_NM["g"]]  # it has the least noise
-        factors = held(_thinned(green if green.size else counting, _CV_SAMPLES)).best_factors()
+        factors = held(thinned(green if green.size else counting, _CV_SAMPLES)).best_factors()
     prepared = held(scored)
     known, own_photo = np.unique(photo[scored], return_inverse=True)
     by_sample, by_photo, held_out = prepared.robust(own_photo, factors)
@@ -328,7 +299,7 @@ def cross_validate(
     return weights, errors, noise, factors
 
 
-def _held_together(photo: NDArray[np.intp], octaves: NDArray[np.float64]) -> NDArray[np.intp]:
+def _held_together(photo: NDArray[np.intp], octaves: Array) -> NDArray[np.intp]:
     """Group samples by photo; those of a photo that is alone at its focal length are held out one by one."""
     groups = photo.copy()  # without that photo the error would be that of zooming, not of its samples
     for number in np.unique(photo):
@@ -340,7 +311,8 @@ def _held_together(photo: NDArray[np.intp], octaves: NDArray[np.float64]) -> NDA
     return groups
 
 
-def _thinned(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+def thinned(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """Rows, or as many of them as are wanted at most, evenly apart."""
     if len(rows) <= most:
         return rows
     return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.intp)]

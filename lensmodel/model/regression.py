@@ -45,7 +45,7 @@ from lensmodel.core.numerics import jit, on_simplex
 from lensmodel.core.psf import PsfSample, resized, second_moments
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, query
-from lensmodel.model.query import PAPER, Part
+from lensmodel.model.query import PAPER, Array, Part
 
 _KNOWN: Final = [0, 1, 2, 4]  # variables that are never unknown: place and wavelength
 _REACH: Final = 5.0  # bandwidths: a Gaussian has fallen to 4e-6 there
@@ -65,9 +65,7 @@ class Neighbourhood:
     A kd-tree holds the variables that every sample and question knows; `scale` (7,) are bandwidths.
     """
 
-    def __init__(
-        self, points: NDArray[np.float64], weights: NDArray[np.float64], scale: NDArray[np.float64]
-    ) -> None:
+    def __init__(self, points: Array, weights: Array, scale: Array) -> None:
         self.points, self.weights, self.scale = points, weights, scale
         self._tree = scipy.spatial.cKDTree((points / scale)[:, _KNOWN])
 
@@ -80,7 +78,7 @@ class Neighbourhood:
             np.array([len(rows) for rows, _ in chosen]),
         )
 
-    def _weighed(self, asked: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    def _weighed(self, asked: Array) -> tuple[NDArray[np.intp], Array]:
         """Rows and weights of sum 1 for one question, the least first (eq. 4 and 7)."""
         rows = self.within(asked, _REACH)
         squared = query.squared_distances(self.points[rows], asked, self.scale)
@@ -96,7 +94,7 @@ class Neighbourhood:
         kept = order[np.cumsum(weight[order]) > _DROPPED * weight.sum()]
         return rows[kept], weight[kept] / weight[kept].sum()
 
-    def within(self, asked: NDArray[np.float64], reach: float) -> NDArray[np.intp]:
+    def within(self, asked: Array, reach: float) -> NDArray[np.intp]:
         """Rows within `reach` bandwidths of a point, but for settings."""
         inside = self._tree.query_ball_point((asked / self.scale)[_KNOWN], reach)
         return np.sort(np.asarray(inside, dtype=np.intp))
@@ -136,7 +134,7 @@ class Regression:
 
     def kernels(
         self, positions: Sequence[FieldPosition], settings: LensSettings, size: int, pitch_um: float | None
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """Return the kernels of many places, shape (q, size, size)."""
         near = self._around.near(positions, settings)
         widths = self._widths.over(np.array([query.point(p, settings) for p in positions]))
@@ -189,12 +187,12 @@ _ROUNDS = 4  # of reweighting: each costs as much, and later ones change less (c
 class WidthField:
     """Widths (s_u, s_v) of the PSF over the field, relative to a reference width of the model."""
 
-    slopes: NDArray[np.float64] | None = None  # (m, 2), of log s_u and log s_v; None = one width everywhere
+    slopes: Array | None = None  # (m, 2), of log s_u and log s_v; None = one width everywhere
     reference: float = 0.0  # logarithm of the width that counts as 1
     stops: float = 0.0  # origins of the settings, where terms of them are zero
     focal: float = 0.0
 
-    def over(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
+    def over(self, where: Array) -> Array:
         """Widths along u and v at points `(n, 7)` of `query`, over the reference width, shape (n, 2)."""
         if self.slopes is None:
             return np.ones((len(where), 2))
@@ -202,7 +200,7 @@ class WidthField:
         logarithms = (self._features(where)[:, :, None] * self.slopes).sum(axis=1)
         return np.clip(np.exp(logarithms - self.reference), *_RANGE)
 
-    def _features(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _features(self, where: Array) -> Array:
         r2 = where[:, 0] ** 2
         x, y = query.vectors(where).T
         stops, focal = where[:, 3] - self.stops, where[:, 5] - self.focal
@@ -214,13 +212,11 @@ class WidthField:
         )
 
     @classmethod
-    def fit(cls, samples: Sequence[PsfSample], weights: NDArray[np.float64]) -> WidthField:
+    def fit(cls, samples: Sequence[PsfSample], weights: Array) -> WidthField:
         """Fit the widths of weighted samples by Huber's weights; one width everywhere below six samples."""
-        rows = np.flatnonzero(weights > 0)
+        rows = query.thinned(np.flatnonzero(weights > 0), _MOST)
         if len(rows) < _MIN_SAMPLES:
             return cls()
-        if len(rows) > _MOST:
-            rows = rows[np.linspace(0, len(rows) - 1, _MOST).round().astype(np.intp)]
         samples = [samples[int(i)] for i in rows]
         where = query.points(samples)
         known = (column[~np.isnan(column)] for column in (where[:, 3], where[:, 5]))
@@ -273,7 +269,7 @@ class Answers:
     """Which samples answer which questions, with which weights."""
 
     rows: NDArray[np.intp]  # (m,), samples, one question after the other
-    weights: NDArray[np.float64]  # (m,), sum 1 in each question
+    weights: Array  # (m,), sum 1 in each question
     counts: NDArray[np.intp]  # (questions,), samples of each
 
     def part(self, questions: NDArray[np.intp]) -> Answers:
@@ -288,12 +284,12 @@ class LocalKernels:
 
     side: int  # odd side of the stored kernels
     splines: NDArray[np.float32]  # (n, (2 (side - 1) + 1 + 2 rims)^2), coefficients
-    angles: NDArray[np.float64]  # (n,), phi of the places in radians
-    radii: NDArray[np.float64]  # (n,), of the light in steps of the grid
-    widths: NDArray[np.float64]  # (n, 2), scales (s_u, s_v) of the places
+    angles: Array  # (n,), phi of the places in radians
+    radii: Array  # (n,), of the light in steps of the grid
+    widths: Array  # (n, 2), scales (s_u, s_v) of the places
 
     @classmethod
-    def of(cls, samples: Sequence[PsfSample], where: NDArray[np.float64], field: WidthField) -> LocalKernels:
+    def of(cls, samples: Sequence[PsfSample], where: Array, field: WidthField) -> LocalKernels:
         """Keep samples at points `where` (n, 7)."""
         side = max(s.kernel.shape[0] for s in samples)
         stored = np.empty((len(samples), (_FINER * (side - 1) + 1 + 2 * _RIM) ** 2), dtype=np.float32)
@@ -305,9 +301,7 @@ class LocalKernels:
         angles = np.array([s.position.phi for s in samples])
         return cls(side, stored, angles, radii, field.over(where))
 
-    def kernels(
-        self, answers: Answers, angles: NDArray[np.float64], widths: NDArray[np.float64], size: int
-    ) -> NDArray[np.float64]:
+    def kernels(self, answers: Answers, angles: Array, widths: Array, size: int) -> Array:
         """Means of the neighbours at places of `angles` (q,) and `widths` (q, 2), shape (q, size, size).
 
         Centring moves the points at which the splines are read: kernels are not resampled again.
@@ -328,20 +322,13 @@ class LocalKernels:
                 break
         return np.asarray(light / light.sum(axis=(1, 2), keepdims=True))
 
-    def upright(self, rows: NDArray[np.intp]) -> NDArray[np.float64]:
+    def upright(self, rows: NDArray[np.intp]) -> Array:
         """Kernels at phi = 0 and unit width, rows towards -v, columns towards u, shape (m, side, side)."""
         count, side = len(rows), 2 * int(np.ceil(self.side // 2 * _ROOM)) + 1
         single = Answers(rows, np.ones(count), np.ones(count, dtype=np.intp))
         return self._sums(single, np.zeros(count), np.ones((count, 2)), np.zeros((count, 2)), side)
 
-    def _sums(
-        self,
-        answers: Answers,
-        angles: NDArray[np.float64],
-        widths: NDArray[np.float64],
-        shifts: NDArray[np.float64],
-        size: int,
-    ) -> NDArray[np.float64]:
+    def _sums(self, answers: Answers, angles: Array, widths: Array, shifts: Array, size: int) -> Array:
         """Weighted sums of the samples of each answer, which may be negative and off the centre."""
         rows, asked = answers.rows, np.repeat(np.arange(len(angles)), answers.counts)
         scale = self.widths[rows] / widths[asked]
@@ -353,7 +340,7 @@ class LocalKernels:
         return out
 
 
-def without_negatives(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def without_negatives(values: Array) -> Array:
     """The nearest values that are not negative and have the same sum, of each row of (q, n).
 
     Clipping alone would keep the crests of a spline's ripples round a sharp kernel and drop their troughs.
@@ -365,13 +352,13 @@ def without_negatives(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return lowered
 
 
-def _frames(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _frames(angles: Array) -> Array:
     """L of each angle: from (row, col) to (u, v), shape (n, 2, 2)."""
     c, s = np.cos(angles), np.sin(angles)
     return np.stack([np.stack([-s, c], axis=-1), np.stack([-c, -s], axis=-1)], axis=-2)
 
 
-def coefficients(kernel: NDArray[np.floating]) -> NDArray[np.float64]:
+def coefficients(kernel: NDArray[np.floating]) -> Array:
     """Coefficients of the spline through the pixels of a kernel, `(k, k)` to `(2 (k - 1) + 1,) * 2`."""
     turns = 1.0 - 2.0 * (np.arange(kernel.shape[0]) % 2)
     contrast = max(abs(float(turns @ kernel.sum(axis=axis))) for axis in (0, 1)) / float(kernel.sum())
@@ -380,7 +367,7 @@ def coefficients(kernel: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=16)
-def _refining(side: int, degree: int) -> NDArray[np.float64]:
+def _refining(side: int, degree: int) -> Array:
     """Matrix from the pixels of an axis to the coefficients of the finer grid, zeros around both."""
     half = side // 2
     fine = np.arange(-half * _FINER, half * _FINER + 1)
@@ -438,13 +425,13 @@ def _value(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.flo
 @jit
 def spline_sums(
     rows: NDArray[np.float32],
-    radii: NDArray[np.float64],
+    radii: Array,
     chosen: NDArray[np.intp],
-    weights: NDArray[np.float64],
-    maps: NDArray[np.float64],
+    weights: Array,
+    maps: Array,
     starts: NDArray[np.intp],
-    shifts: NDArray[np.float64],
-    out: NDArray[np.float64],
+    shifts: Array,
+    out: Array,
 ) -> None:
     """Add weighted sums of splines, read through affine maps, to `out` (answers, size, size).
 

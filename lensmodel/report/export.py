@@ -12,42 +12,42 @@ import io
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import LensSettings
 from lensmodel.model import LensModel
 from lensmodel.report.centring import EDGE_R
-from lensmodel.report.lens_report import DIRECTIONS, UNIT_NAMES, ApertureReport, LensReport, grid
+from lensmodel.report.lens_report import (
+    DEFAULT_ASPECT,
+    DIRECTIONS,
+    UNIT_NAMES,
+    ApertureReport,
+    LensReport,
+    grid,
+)
+
+PsfGrid: TypeAlias = dict[str, Any]
+"""Arrays of n = rows * cols places, row by row from the top left: `psf` (n, k, k) float32; `r` in half
+diagonals, `phi` in radians counter-clockwise from the right, `error`, the expected relative L2, and
+`aperture`, (n,); `shape` (rows, cols); and `channel`."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PsfGrid:
-    """Kernels at n = rows * cols places, row by row from the top left."""
-
-    kernels: NDArray[np.float32]  # (n, k, k)
-    r: NDArray[np.float64]  # (n,), half-diagonals
-    phi: NDArray[np.float64]  # (n,), radians, counter-clockwise from the right
-    predicted_error: NDArray[np.float64]  # (n,), expected relative L2 of each kernel
-    rows: int
-    cols: int
-    settings: LensSettings
-
-
-def psf_grid(
-    model: LensModel, settings: LensSettings, *, rows: int, cols: int, size: int, aspect: float
-) -> PsfGrid:
+def psf_grid(model: LensModel, settings: LensSettings, *, rows: int, cols: int, size: int) -> PsfGrid:
     """Ask a model for the kernels of a grid of places."""
-    places = grid(rows, cols, aspect)
+    places = grid(rows, cols, DEFAULT_ASPECT)
     answers = [model.query(place, settings, size) for place in places]
-    r, phi, error = np.array(
-        [(p.r, p.phi, a.predicted_error) for p, a in zip(places, answers, strict=True)]
-    ).T
-    return PsfGrid(np.array([a.kernel for a in answers], np.float32), r, phi, error, rows, cols, settings)
+    return {
+        "psf": np.array([answer.kernel for answer in answers], np.float32),
+        "r": np.array([place.r for place in places]),
+        "phi": np.array([place.phi for place in places]),
+        "error": np.array([answer.predicted_error for answer in answers]),
+        "aperture": np.full(len(places), settings.aperture, np.float64),  # not a number where unknown
+        "shape": np.array([rows, cols]),
+        "channel": np.array(settings.channel),
+    }
 
 
 def to_fits(psfs: PsfGrid) -> bytes:
@@ -64,22 +64,19 @@ def to_fits(psfs: PsfGrid) -> bytes:
             "writing FITS needs astropy; install it with `pip install '.[fits]'` in this program's folder, "
             "or export npz instead"
         ) from error
-    cube = psfs.kernels[:, ::-1, :]
+    cube, (rows, cols) = psfs["psf"][:, ::-1, :], psfs["shape"].tolist()
     primary = fits.PrimaryHDU(np.ascontiguousarray(cube[0] if len(cube) == 1 else cube))
-    for key, value, meaning in (
-        ("ROWORDER", "BOTTOM-UP", "first row stored is the bottom one"),
-        ("GRIDROWS", psfs.rows, "rows of the grid of places"),
-        ("GRIDCOLS", psfs.cols, "columns of the grid of places"),
-        ("FILTER", psfs.settings.channel, "colour channel"),
-        ("FNUMBER", psfs.settings.aperture, "aperture, f-number"),
-        ("COMMENT", "point spread functions by lensmodel, sum 1", ""),
-    ):
-        if value is not None:
-            primary.header[key] = (value, meaning)
+    header = primary.header
+    header["ROWORDER"] = ("BOTTOM-UP", "first row stored is the bottom one")
+    header["GRIDROWS"], header["GRIDCOLS"] = rows, cols
+    header["FILTER"] = (str(psfs["channel"]), "colour channel")
+    if math.isfinite(aperture := float(psfs["aperture"][0])):
+        header["FNUMBER"] = (aperture, "aperture, f-number")
+    header["COMMENT"] = "point spread functions by lensmodel, sum 1"
     columns = [
-        fits.Column("R", "D", unit="half-diagonal", array=psfs.r),
-        fits.Column("PHI", "D", unit="rad", array=psfs.phi),
-        fits.Column("ERROR", "D", array=psfs.predicted_error),
+        fits.Column("R", "D", unit="half-diagonal", array=psfs["r"]),
+        fits.Column("PHI", "D", unit="rad", array=psfs["phi"]),
+        fits.Column("ERROR", "D", array=psfs["error"]),
     ]
     out = io.BytesIO()
     fits.HDUList([primary, fits.BinTableHDU.from_columns(columns, name="POSITIONS")]).writeto(out)
@@ -87,35 +84,25 @@ def to_fits(psfs: PsfGrid) -> bytes:
 
 
 def to_npz(psfs: PsfGrid) -> bytes:
-    """NumPy archive with `psf` (n, k, k), `shape` (rows, cols), and r, phi, error of each place."""
+    """NumPy archive of the arrays."""
     out = io.BytesIO()
-    aperture = np.full(len(psfs.r), psfs.settings.aperture, dtype=np.float64)  # not a number where unknown
-    shape, channel = np.array([psfs.rows, psfs.cols]), np.array(psfs.settings.channel)
-    np.savez_compressed(
-        out,
-        psf=psfs.kernels,
-        r=psfs.r,
-        phi=psfs.phi,
-        error=psfs.predicted_error,
-        shape=shape,
-        aperture=aperture,
-        channel=channel,
-    )
+    np.savez_compressed(out, **psfs)
     return out.getvalue()
 
 
 def to_json(psfs: PsfGrid) -> bytes:
     """JSON: a bare matrix, a list of rows, for a single place, as ART loads it; else an object with units."""
-    matrices = [[[float(f"{v:.9g}") for v in row] for row in kernel] for kernel in psfs.kernels]
+    matrices = [[[float(f"{v:.9g}") for v in row] for row in kernel] for kernel in psfs["psf"]]
     if len(matrices) == 1:
         return json.dumps(matrices[0], allow_nan=False).encode()
-    places = zip(psfs.r.tolist(), psfs.phi.tolist(), psfs.predicted_error.tolist(), matrices, strict=True)
+    aperture, (rows, cols) = float(psfs["aperture"][0]), psfs["shape"].tolist()
+    places = zip(*(psfs[name].tolist() for name in ("r", "phi", "error")), matrices, strict=True)
     content = {
         "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
-        "aperture": psfs.settings.aperture,
-        "channel": psfs.settings.channel,
-        "rows": psfs.rows,
-        "cols": psfs.cols,
+        "aperture": aperture if math.isfinite(aperture) else None,
+        "channel": str(psfs["channel"]),
+        "rows": rows,
+        "cols": cols,
         "psfs": [dict(zip(("r", "phi", "predicted_error", "kernel"), each, strict=True)) for each in places],
     }
     return json.dumps(content, allow_nan=False).encode()

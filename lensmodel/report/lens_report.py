@@ -27,10 +27,15 @@ from lensmodel.neural.network import RING_MIDDLES
 from lensmodel.quality import crossing, mtf50_from_kernel, mtf_from_kernel
 from lensmodel.report.centring import Centring, centring
 
-# Width over height of a 35 mm frame; a profile does not say how wide its photos were
+# Width over height of a 35 mm frame: its corners lie within those of other cameras, and a profile does not
+# say how wide its photos were
 DEFAULT_ASPECT: Final = 1.5
 Unit = Literal["c/px", "lp/ph", "lp/mm"]
-UNIT_NAMES: Final[dict[Unit, str]] = {"c/px": "c/px", "lp/ph": "LP/PH", "lp/mm": "lp/mm"}
+UNIT_NAMES: Final[dict[Unit, str]] = {
+    "c/px": "cycles/pixel",
+    "lp/ph": "line pairs per picture height",
+    "lp/mm": "line pairs per mm",
+}
 DIRECTIONS: Final = ("tangential", "sagittal")
 # Cycles/pixel: beyond it a sensor shows no finer lines, and a measured MTF50 says only "at least"
 NYQUIST: Final = 0.5
@@ -55,11 +60,7 @@ MARKED: Final = (
     *("centre", "left", "right", "top", "bottom"),
     *("upper left corner", "upper right corner", "lower left corner", "lower right corner"),
 )
-_ASPECTS: Final = (1.0, 4 / 3, 1.5, 16 / 9)
-_FILLED: Final = 0.85  # of the way to a side that samples reach at least (chosen: patches end short of it)
-
 _CAUTION: Final = "Caution"  # name among the details of a report of what to allow for in its figures
-_NAMED: Final = 8  # photos that a report names (chosen: two lines)
 # Expected relative L2 of a kernel that another photo would not better by what is seen (chosen)
 _WELL_KNOWN: Final = 0.1
 # Expected relative L2 of a kernel from which on a place is drawn as unknown (chosen: half may be wrong)
@@ -196,7 +197,6 @@ class LensReport:
     tested: tuple[ApertureReport, ...]  # by aperture, ascending
     # what else stands on the page: camera, serial, names of photos
     details: Mapping[str, str] = field(default_factory=dict)
-    measured: bool = False  # whether photos of charts, targets or points alone tell of the lens
 
     def at(self, aperture: float | None) -> ApertureReport:
         """Return what was found at an aperture; at the widest for None or one not tested."""
@@ -218,11 +218,6 @@ class LensReport:
     @property
     def advice(self) -> str:
         """Which photo would help most: of the place and aperture whose blur is known least."""
-        if self.measured and self.tested[0].unknown_share:
-            return (
-                "Nothing is known beyond the outermost places that were measured: what you photograph to "
-                "measure, let it fill the frame."
-            )
         spots = [(spot, one) for one in self.tested for spot in one.spots]
         least, tested = max(spots, key=lambda pair: pair[0].predicted_error)
         if least.predicted_error < _WELL_KNOWN:
@@ -255,13 +250,10 @@ def caution(photos: Sequence[str]) -> str:
 
 def provenance(serial: str | None, cameras: Iterable[str], photos: Sequence[str]) -> dict[str, str]:
     """Say on which copy and photos a report rests, when and by what it was written; a caveat for JPEG."""
-    names = sorted(photos)
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     details = {
         "Serial number": serial or "",
         "Camera": ", ".join(dict.fromkeys(filter(None, cameras))),
-        "Photos": ", ".join(names[:_NAMED]) + more,
-        _CAUTION: caution(names),
+        _CAUTION: caution(photos),
         "Written": f"{datetime.now(UTC):%Y-%m-%d} by lensmodel {version('lensmodel')}",
     }
     return {name: words for name, words in details.items() if words}
@@ -271,7 +263,7 @@ def lens_report(
     model: LensModel,
     name: str,
     *,
-    aspect: float | None = None,
+    aspect: float = DEFAULT_ASPECT,
     height_px: int | None = None,
     apertures: Sequence[float] | None = None,
     rows: int = _ROWS,
@@ -281,11 +273,9 @@ def lens_report(
 ) -> LensReport:
     """Report on a lens at the apertures of its photos, or at those that are given.
 
-    Unless they are given, the aspect (width over height) of its photos and their height in pixels are what
-    its samples come to. `rows` counts those of the maps, `size` is the odd side of the kernels in pixels,
-    `details` are shown as they are.
+    `aspect` is the width over height of its photos, `height_px` their height in pixels, by default what its
+    samples come to; `rows` counts those of the maps, `size` is the odd side of the kernels in pixels.
     """
-    aspect = filled_aspect(model) if aspect is None else aspect
     cols = max(3, round(rows * aspect))
     places = [*marked_places(aspect).items(), *(("", at) for at in grid(rows, cols, aspect))]
     numbers = _chosen(model) if apertures is None else apertures
@@ -321,7 +311,6 @@ def lens_report(
         sensor=SensorGeometry(pitch, height_px),
         tested=tuple(tested),
         details=dict(details or {}),
-        measured=measured,
     )
 
 
@@ -458,17 +447,6 @@ def _chosen(model: LensModel) -> list[float]:
 def _shared(values: Iterable[float | None]) -> float | None:
     known = set(values)
     return next(iter(known)) if len(known) == 1 else None
-
-
-def filled_aspect(model: LensModel) -> float:
-    """Aspect of common sensors whose sides the samples reach alike; 3:2 where they leave its sides free.
-
-    A chart has a shape of its own, and says nothing of the frame's.
-    """
-    places = [s.position.xy for s in model.samples if not s.measured] or [(0.0, 0.0)]
-    shares = {aspect: np.abs(places).max(axis=0) / half_sides(aspect) for aspect in _ASPECTS}
-    inside = [a for a, share in shares.items() if share.max() <= 1.0 and share.min() > _FILLED]
-    return min(inside, key=lambda a: float(np.ptp(shares[a])), default=DEFAULT_ASPECT)
 
 
 # --- places of the field -------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.report.lens_report import NYQUIST, ApertureReport, LensReport, Unit
+from lensmodel.report.lens_report import NYQUIST, UNIT_NAMES, ApertureReport, LensReport, Unit
 
 try:
     import matplotlib as mpl
@@ -31,11 +31,6 @@ _SHARPNESS: Final = LinearSegmentedColormap.from_list(
     "sharpness", [(0.0, "#7f1d1d"), (0.35, "#fdf6e3"), (0.7, "#0b6e99"), (1.0, "#083d56")]
 )
 _INKS: Final = ("#0b6e99", "#b45309", "#15803d", "#7e22ce")
-_UNITS: Final[dict[Unit, str]] = {
-    "c/px": "cycles/pixel",
-    "lp/ph": "line pairs per picture height",
-    "lp/mm": "line pairs per mm",
-}
 _CHART: Final = (7.0, 3.7)  # inches of a single chart (chosen: two side by side on a wide screen)
 _PAGE: Final = (8.27, 11.69)  # inches: A4
 _LETTERS_OF_A_LINE: Final = 1020.0  # over the size in points: of DejaVu Sans, narrower than the page (chosen)
@@ -43,8 +38,7 @@ _A_PAGE: Final = 2  # panels below each other on a page: those of one aperture
 _HATCHED: Final[dict[str, Any]] = {"facecolor": "#f4f4f2", "edgecolor": "#a8a8a2", "hatch": "////", "lw": 0}
 _LUMA: Final = (0.2126, 0.7152, 0.0722)  # of red, green and blue (ITU-R BT.709)
 _PALE: Final = 0.45  # luma from which on dark figures are read best (chosen)
-_SEEN: Final = 0.01  # of the brightest pixel of a point: darker ones look black (chosen)
-_LEAST_HALF: Final = 5  # pixels shown around a point on each side, at least (chosen)
+_SHOWN: Final = 9  # pixels shown around a point on each side (chosen)
 _STYLE: Final[dict[str, Any]] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
@@ -132,7 +126,7 @@ def _panels(report: LensReport, tested: Iterable[ApertureReport], unit: Unit) ->
     for found in tested:
         ways = "sagittal (S) solid, tangential (T) dashed"
         maps = partial(_maps, found, report.sensor.units.get(unit, 1.0))
-        panels.append((f"MTF50 in {_UNITS[unit]}{_at(found)}", maps))
+        panels.append((f"MTF50 in {UNIT_NAMES[unit]}{_at(found)}", maps))
         title = f"Contrast from the centre to the corner{_at(found)}: {ways}"
         panels.append((title, partial(_contrast, found)))
     if len(report.apertures) > 1:
@@ -216,13 +210,10 @@ def _empty(ax: Axes) -> None:
 def _points(found: ApertureReport, place: Place) -> None:
     """What becomes of a point in the centre and in each corner; the worst one's name is bold."""
     spots = (found.spots[0], *found.corners)
-    kernels = [np.array(spot.kernel) for spot in spots]
-    middle = len(kernels[0]) // 2
-    bright = [np.abs(np.argwhere(kernel > _SEEN * kernel.max()) - middle).max() for kernel in kernels]
-    half = min(max(_LEAST_HALF, *bright), middle)
-    near = slice(middle - half, middle + half + 1)
-    for ax, spot, kernel in zip(place.subplots(1, len(kernels)), spots, kernels, strict=True):
-        ax.imshow(kernel[near, near], cmap="gray", vmin=0.0)
+    for ax, spot in zip(place.subplots(1, len(spots)), spots, strict=True):
+        cut = max(len(spot.kernel) // 2 - _SHOWN, 0)
+        near = slice(cut, len(spot.kernel) - cut)
+        ax.imshow(np.array(spot.kernel)[near, near], cmap="gray", vmin=0.0)
         name = spot.place + ("\n(not known)" if spot.unknown else "")
         ax.set_title(name, weight="bold" if spot is found.worst else "normal", va="bottom")
         ax.set_xlabel(spot.words.replace(", S", "\nS"), fontsize=7.5)
@@ -249,7 +240,7 @@ def _over_apertures(report: LensReport, unit: Unit, place: Place) -> None:
         ax.plot(values, "o-", label=spot.place, lw=2.5 if k == 0 else 1.2)
     ax.set_xticks(range(len(spots)), [one.at for one in report.tested])
     ax.set_ylim(bottom=0.0)
-    ax.set_ylabel(f"MTF50, {_UNITS[unit]}")
+    ax.set_ylabel(f"MTF50, {UNIT_NAMES[unit]}")
     _legend(ax)
 
 

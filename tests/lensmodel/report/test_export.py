@@ -32,19 +32,20 @@ def model() -> LensModel:
 
 @pytest.fixture(scope="module")
 def psfs(model: LensModel) -> PsfGrid:
-    return psf_grid(model, SETTINGS, rows=2, cols=3, size=15, aspect=1.5)
+    return psf_grid(model, SETTINGS, rows=2, cols=3, size=15)
 
 
 def arrow() -> PsfGrid:
     """One kernel with its light above and to the right: a flipped axis shows."""
     kernel = np.zeros((1, 5, 5), dtype=np.float32)
     kernel[0, 0, 2], kernel[0, 2, 4] = 0.75, 0.25
-    return PsfGrid(kernel, *np.array([[0.5], [1.0], [0.1]]), 1, 1, SETTINGS)
+    places = dict(zip(("r", "phi", "error", "aperture"), np.array([[0.5], [1.0], [0.1], [2.0]]), strict=True))
+    return {"psf": kernel, **places, "shape": np.array([1, 1]), "channel": np.array("g")}
 
 
 def test_a_grid_asks_the_model_at_each_place(model: LensModel, psfs: PsfGrid) -> None:
-    assert psfs.kernels.shape == (6, 15, 15)
-    for r, phi, kernel in zip(psfs.r, psfs.phi, psfs.kernels, strict=True):
+    assert psfs["psf"].shape == (6, 15, 15)
+    for r, phi, kernel in zip(psfs["r"], psfs["phi"], psfs["psf"], strict=True):
         assert kernel == pytest.approx(model.query(FieldPosition(r, phi), SETTINGS, 15).kernel, abs=1e-7)
 
 
@@ -53,12 +54,12 @@ def test_fits_is_a_cube_stored_from_the_bottom_with_a_table_of_places(psfs: PsfG
     with fits.open(io.BytesIO(EXPORTERS["fits"](psfs))) as file:
         cube, header = file[0].data, file[0].header
         table = file["POSITIONS"].data
-        assert np.array_equal(cube[:, ::-1], psfs.kernels)
+        assert np.array_equal(cube[:, ::-1], psfs["psf"])
         assert header["BITPIX"] == -32
         assert header["ROWORDER"] == "BOTTOM-UP"
         assert header["FNUMBER"] == 2.0
-        assert table["R"].tolist() == psfs.r.tolist()
-        assert table["PHI"].tolist() == psfs.phi.tolist()
+        assert table["R"].tolist() == psfs["r"].tolist()
+        assert table["PHI"].tolist() == psfs["phi"].tolist()
 
 
 @pytest.mark.parametrize("form", ["fits", "json"])
@@ -84,9 +85,9 @@ def test_fits_without_astropy_names_the_remedy(psfs: PsfGrid, monkeypatch: pytes
 
 def test_npz_holds_kernels_and_places_without_pickle(psfs: PsfGrid) -> None:
     with np.load(io.BytesIO(EXPORTERS["npz"](psfs)), allow_pickle=False) as stored:
-        assert np.array_equal(stored["psf"], psfs.kernels)
-        assert stored["r"].tolist() == psfs.r.tolist()
-        assert stored["phi"].tolist() == psfs.phi.tolist()
+        assert np.array_equal(stored["psf"], psfs["psf"])
+        assert stored["r"].tolist() == psfs["r"].tolist()
+        assert stored["phi"].tolist() == psfs["phi"].tolist()
         assert stored["shape"].tolist() == [2, 3]
         assert set(stored["aperture"]) == {2.0}
 
@@ -94,12 +95,12 @@ def test_npz_holds_kernels_and_places_without_pickle(psfs: PsfGrid) -> None:
 def test_json_of_a_grid_holds_every_kernel_to_the_last_bit(psfs: PsfGrid) -> None:
     stored = json.loads(EXPORTERS["json"](psfs))
     kernels = np.array([entry["kernel"] for entry in stored["psfs"]], dtype=np.float32)
-    assert np.array_equal(kernels, psfs.kernels)
+    assert np.array_equal(kernels, psfs["psf"])
     assert (stored["rows"], stored["cols"], stored["aperture"]) == (2, 3, 2.0)
 
 
 def test_a_single_place_is_the_middle(model: LensModel) -> None:
-    one = psf_grid(model, SETTINGS, rows=1, cols=1, size=15, aspect=1.5)
+    one = psf_grid(model, SETTINGS, rows=1, cols=1, size=15)
 
-    assert one.r.tolist() == [0.0]
-    assert np.hypot(*centroid(one.kernels[0].astype(np.float64))) < 2e-3
+    assert one["r"].tolist() == [0.0]
+    assert np.hypot(*centroid(one["psf"][0].astype(np.float64))) < 2e-3

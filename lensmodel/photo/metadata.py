@@ -73,8 +73,7 @@ class Said:
             if header.directory:  # a preview may stand before the photo
                 main.update(reader.directory(header.directory)[0])
             main.update(reader.below(main, containers.EXIF))
-            if 0x927C in main:
-                note_in = reader
+            note_in = reader if 0x927C in main else note_in
             tags = Tags({**main, **tags})
         note = _maker_note(tags.text(0x010F) or "", tags[0x927C], note_in) if note_in else PhotoMetadata()
         return cls(header, tags, read_xmp(header.xmp), note)

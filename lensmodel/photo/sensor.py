@@ -293,20 +293,6 @@ Places: TypeAlias = NDArray[np.int64]
 """Pixels of a mosaic that is continued beyond its rim, by their number, row by row."""
 
 
-def replace_defects(values: NDArray[np.uint16], colours: NDArray[np.uint8], period: int) -> int:
-    """Replace pixels that stand alone by the median of the nearest sound ones of their colour."""
-    near = Neighbours(values, colours, period)
-    places = defects(near)
-    around = near.of(places)
-    ring = np.where(np.isin(around, places), np.nan, near.values[around].astype(np.float32))
-    first = np.argsort(np.isnan(ring), axis=0, kind="stable")[:_FILLED_FROM]
-    ring = np.take_along_axis(ring, first, axis=0)
-    sound = ~np.isnan(ring).all(axis=0)
-    rows, cols = (index - _RIM for index in np.divmod(places[sound], near.width))
-    values[rows, cols] = np.rint(np.nanmedian(ring[:, sound], axis=0))
-    return len(rows)
-
-
 class Neighbours:
     """A mosaic, continued beyond its rim by what lies whole periods inside, and like pixels in it."""
 
@@ -332,8 +318,9 @@ class Neighbours:
         return np.median(self.values[self.of(places)].astype(np.float32), axis=0)
 
 
-def defects(near: Neighbours) -> Places:
-    """Find the pixels of a mosaic that stand alone, brighter or darker than all around them."""
+def replace_defects(values: NDArray[np.uint16], colours: NDArray[np.uint8], period: int) -> int:
+    """Replace pixels that stand alone by the median of the nearest sound ones of their colour; count them."""
+    near = Neighbours(values, colours, period)
     levels, deviations = _noise(near)
     least = (_NEARLY[0] * np.interp(np.arange(1 << 16), levels, deviations)).astype(np.float32)
     places = np.flatnonzero(_standing_out(near.values, near.offsets, near.width, least))
@@ -351,9 +338,17 @@ def defects(near: Neighbours) -> Places:
         return places[chosen & (np.abs(bumps).max(axis=0) < most_beside * height + 4.0 * sigma)]
 
     sure, likely = alone(*_SURE), alone(*_LIKELY)
-    if len(sure) > _MOST * math.prod(near.shape):
-        return places[:0]
-    return likely if len(sure) > _MANY * len(np.setdiff1d(likely, sure)) else sure
+    if len(sure) > _MOST * values.size:
+        return 0
+    defects = likely if len(sure) > _MANY * len(np.setdiff1d(likely, sure)) else sure
+    around = near.of(defects)
+    ring = np.where(np.isin(around, defects), np.nan, near.values[around].astype(np.float32))
+    first = np.argsort(np.isnan(ring), axis=0, kind="stable")[:_FILLED_FROM]
+    ring = np.take_along_axis(ring, first, axis=0)
+    sound = ~np.isnan(ring).all(axis=0)
+    rows, cols = (index - _RIM for index in np.divmod(defects[sound], near.width))
+    values[rows, cols] = np.rint(np.nanmedian(ring[:, sound], axis=0))
+    return len(rows)
 
 
 def _noise(near: Neighbours) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

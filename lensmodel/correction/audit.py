@@ -156,21 +156,22 @@ def _around(plane: Real, rim: int = 0) -> Real:
 def _spikes(y: Real, shown: Real, variance: Real, gains: Real) -> Real:
     """What each pixel of a colour loses because it stands out."""
     lost, most, limit = np.zeros_like(y), np.float32(_SPIKE), np.float32(_STANDS_OUT)
+    least, out = np.square(limit * most), np.empty(y.shape[2], np.float32)
     for c in range(y.shape[0]):
         for i in range(1, y.shape[1] - 1):
+            above, here, below = shown[c, i - 1], shown[c, i], shown[c, i + 1]
             for j in range(1, y.shape[2] - 1):
-                here, left, right = shown[c, i, j], shown[c, i, j - 1], shown[c, i, j + 1]
-                out, least = max(here - max(left, right), min(left, right) - here), limit * most
-                if not out > ZERO or out * out <= least * least * variance[c, i, j]:
-                    continue
-                top, low = max(left, right), min(left, right)
-                for k in range(j - 1, j + 2):
-                    top = max(top, shown[c, i - 1, k], shown[c, i + 1, k])
-                    low = min(low, shown[c, i - 1, k], shown[c, i + 1, k])
-                window = y[c, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3]
-                bump = abs(y[c, i, j] - window.sum() / np.float32(window.size))
-                allowed = limit * (gains[c] * bump + most * np.sqrt(variance[c, i, j]))
-                lost[c, i, j] = min(max(max(here - top, low - here) / allowed - ONE, ZERO), ONE)
+                top = max(above[j - 1], above[j], above[j + 1], here[j - 1], here[j + 1])
+                low = min(above[j - 1], above[j], above[j + 1], here[j - 1], here[j + 1])
+                top = max(top, below[j - 1], below[j], below[j + 1])
+                low = min(low, below[j - 1], below[j], below[j + 1])
+                out[j] = max(here[j] - top, low - here[j], ZERO)
+            for j in range(1, y.shape[2] - 1):
+                if out[j] * out[j] > least * variance[c, i, j]:
+                    window = y[c, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3]
+                    bump = abs(y[c, i, j] - window.sum() / np.float32(window.size))
+                    figure = out[j] / (gains[c] * bump + most * np.sqrt(variance[c, i, j]))
+                    lost[c, i, j] = min(max(figure / limit - ONE, ZERO), ONE)
     return lost
 
 

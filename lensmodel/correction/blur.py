@@ -169,7 +169,7 @@ class UniformBlur:
     def _spectra(self) -> dict[tuple[int, int], Complex]:
         return {}
 
-    @property
+    @cached_property
     def reach(self) -> int:
         """Pixels by which the latent plane is wider than the frame on each side."""
         beyond = max(abs(self.offset[0]), abs(self.offset[1]))
@@ -372,14 +372,19 @@ def fitted_halo(cell: tuple[int, int], least: int) -> int:
     return least + min(np.subtract(fast_shape(needed), needed)) // 2
 
 
+@jit
 def block_sums(plane: Real, side: int, rim: int = 0) -> Real:
-    """Sums over square blocks of the pixels of a plane with zeros around it; the last ones may be smaller."""
-    rows, cols = (-(-(extent + 2 * rim) // side) for extent in plane.shape)
-    padded = np.zeros((rows * side, cols * side), dtype=np.float32)
-    padded[rim : rim + plane.shape[0], rim : rim + plane.shape[1]] = plane
-    # one sum over both axes takes three times as long
-    lines = padded.reshape(rows, side, cols * side).sum(axis=1)
-    return np.asarray(lines.reshape(rows, cols, side).sum(axis=2))
+    """Sums over square blocks of a plane with `rim` pixels of zeros around; the last ones may be smaller."""
+    rows, cols = plane.shape
+    sums = np.zeros((-(-(rows + 2 * rim) // side), -(-(cols + 2 * rim) // side)), np.float32)
+    for block in range(sums.shape[0]):
+        line, first = np.zeros(cols, np.float32), side * block - rim
+        for i in range(max(first, 0), min(first + side, rows)):
+            for j in range(cols):
+                line[j] += plane[i, j]
+        for j in range(cols):
+            sums[block, (j + rim) // side] += line[j]
+    return sums
 
 
 def interpolated(blocks: Real, side: int, rows: int, cols: int) -> Real:

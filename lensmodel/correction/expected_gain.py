@@ -26,7 +26,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
 from lensmodel.core.psf import delta, otf
 from lensmodel.core.types import Channel, FieldPosition, Kernel, Planes, Zone
-from lensmodel.correction.blur import Complex, Number, Real, Sensor, UniformBlur
+from lensmodel.correction.blur import ONE, ZERO, Complex, Number, Real, Sensor, UniformBlur
 
 GRID: Final = (64, 64)  # pixels: variances are given at its `rfft2` frequencies
 WIDEST: Final = 63  # pixels: side of the largest kernel that the grid holds
@@ -95,16 +95,6 @@ _MOSAIC_NOISE: Final = np.array([[4.8, 4.0, 3.0, 2.0], [2.35, 2.2, 2.05, 1.75], 
 demosaicing spreads what few pixels saw, and would pass for detail in focus if it counted as white."""
 
 _BLOCKS: Final = 3  # along each side of a tile: enough for a mean (chosen)
-
-
-def scene_power(level: float, slope: float) -> Real:
-    """Power of a scene on the `rfft2` grid of `GRID`, S = c |f|^-a with c and a of `scene_law`."""
-    return np.asarray(level * np.exp(np.float32(-0.5 * slope) * _log_squared()), dtype=np.float32)
-
-
-def softness(slope: float) -> float:
-    """How far a scene of this slope is out of focus, 0 to 1."""
-    return min(max((slope - _SOFT[0]) / (_SOFT[1] - _SOFT[0]), 0.0), 1.0)
 
 
 def noise_power(variance: float, channel: int, *, mosaic: bool) -> NDArray[np.float64]:
@@ -251,12 +241,13 @@ class CellForecast:
         change is so small that the error cannot have fallen by `least` decibels.
         """
         scale = GRID[0] * GRID[1] / photo[0].size
-        change = scale * _squared_distance(photo, result)
+        change, made = (
+            scale * float(np.square(planes - photo).sum(dtype=np.float64)) for planes in (result, solution)
+        )
         if change < (1.0 - 10.0 ** (-0.1 * least)) * self.before:
             return None
         if mosaic:
             return replace(self, after=(1.0 - min(change / self.before, _MOST)) * self.before)
-        made = scale * _squared_distance(photo, solution)
         return self.weakened(min(change / made, 1.0) if made > 0.0 else 0.0)
 
     def weakened(self, share: float) -> CellForecast:
@@ -313,18 +304,19 @@ def plan(
         seen = noise_power(noise, c, mosaic=sensor.measured is not None)
         law = scene_law(rings[c], K.real**2 + K.imag**2 + posterior.variance, seen)
         scenes.append((K, point, posterior, noise, *law))
-    soft = softness(float(np.median([slope for *_, slope in scenes])))
+    slope = float(np.median([slope for *_, slope in scenes]))
+    soft = min(max((slope - _SOFT[0]) / (_SOFT[1] - _SOFT[0]), 0.0), 1.0)
     before = after = 0.0
     shares: list[float] = []
     for K, point, posterior, noise, level, slope in scenes:
-        left, harm = np.empty((2, _SHARES.size))
-        spectra = (K, point, scene_power(level, slope), posterior.variance, frequency_counts(GRID))
-        narrower = min(_SHARPER * soft * posterior.width_error, 1.0)
-        before += _remaining(
-            *(*spectra, np.float32(noise), _SHARES, np.float32(returned), np.float32(soft)),
-            *(np.float32(narrower), left, harm),
-        )
-        harmless = harm <= 0.0
+        S = level * np.exp(np.float32(-0.5 * slope) * _log_squared())
+        D, times = posterior.variance, frequency_counts(GRID)
+        narrower = np.float32(min(_SHARPER * soft * posterior.width_error, 1.0))
+        H = K * np.clip(np.abs(K), np.float32(1e-6), ONE) ** -narrower if soft > 0.0 else K
+        before += float((times * (S * (np.abs(ONE - K) ** 2 + D) + noise)).sum(dtype=np.float64))
+        scalars = (np.float32(value) for value in (noise, returned, soft))
+        left, harm = _remaining(K, H, point, S, D, times, *scalars)
+        harmless = (harm <= 0.0) | (soft == 0.0)
         harmless[-1] = not harmless[:-1].any()  # by a point only noise is taken
         best = int(np.argmin(np.where(harmless, left, np.inf)))
         shares.append(float(_SHARES[best]))
@@ -335,64 +327,34 @@ def plan(
 
 
 @jit
+def _power(z: Number) -> Number:
+    """|z|²."""
+    return z.real * z.real + z.imag * z.imag
+
+
+@jit
 def _remaining(
-    K: Complex,
-    point: Complex,
-    S: Real,
-    D: Real,
-    times: Real,
-    noise: Number,
-    shares: Real,
-    returned: Number,
-    soft: Number,
-    narrower: Number,
-    out: NDArray[np.float64],
-    harm: NDArray[np.float64],
-) -> float:
-    """Expected squared error that each share of a kernel leaves, and, returned, of the photo; see `plan`.
-
-    `harm` receives by how much the error rises, in a soft scene, if the kernel is `narrower` by this share.
-    """
-    one, least, before = np.float32(1.0), np.float32(_LEAST), np.float64(0.0)
-    sharper = np.ones_like(D)  # |H| / |K|
-    for i in range(K.shape[0]):
-        part = np.float32(0.0)
-        for j in range(K.shape[1]):
-            a, b = one - K[i, j].real, K[i, j].imag
-            part += times[i, j] * (S[i, j] * (a * a + b * b + D[i, j]) + noise)
-            if soft > np.float32(0.0):
-                size = min(max(np.abs(K[i, j]), np.float32(1e-6)), one)
-                sharper[i, j] = np.exp(-narrower * np.log(size))
-        before += part
-    for number in range(shares.size):
-        share, total, rise = shares[number], np.float64(0.0), np.float64(0.0)
+    K: Complex, H: Complex, point: Complex, S: Real, D: Real, times: Real, n: Number, t: Number, soft: Number
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Squared error that each share of a kernel should leave, and its rise if H is true; see `plan`."""
+    left, harm = np.zeros(_SHARES.size), np.zeros(_SHARES.size)
+    for number in range(_SHARES.size):
+        share = _SHARES[number]
         for i in range(K.shape[0]):
-            part, more = np.float32(0.0), np.float32(0.0)
+            part, rise = ZERO, ZERO
             for j in range(K.shape[1]):
-                a, b, s = K[i, j].real, K[i, j].imag, S[i, j]
-                p = share * a + (one - share) * point[i, j].real
-                q = share * b + (one - share) * point[i, j].imag
-                power = p * p + q * q
-                weight = s / max(s * power + noise, least)
-                back = returned * (one - soft * min(power * weight * weight, one))
-                re, im = p * weight + back * (one - power * weight), -q * weight
-                missed, turned = one - re * a + im * b, re * b + im * a
-                kept = re * re + im * im
-                error = s * (missed * missed + turned * turned + kept * D[i, j]) + kept * noise
-                part += times[i, j] * error
-                u, v = sharper[i, j] * a, sharper[i, j] * b
-                missed, turned = one - re * u + im * v, re * v + im * u
-                change = missed * missed + turned * turned - (one - u) * (one - u) - v * v
-                more += times[i, j] * (s * change + max(kept - one, np.float32(0.0)) * noise)
-            total += part
-            rise += more
-        out[number] = total
-        harm[number] = rise if soft > np.float32(0.0) else np.float64(0.0)
-    return before
-
-
-def _squared_distance(a: Planes, b: Planes) -> float:
-    return float(np.square(a - b).sum(dtype=np.float64))
+                k, s = share * K[i, j] + (ONE - share) * point[i, j], S[i, j]
+                power = _power(k)
+                weight = s / max(s * power + n, np.float32(_LEAST))
+                back = t * (ONE - soft * min(power * weight * weight, ONE))
+                G = np.conj(k) * weight + back * (ONE - power * weight)
+                kept = _power(G)
+                part += times[i, j] * (s * (_power(ONE - G * K[i, j]) + kept * D[i, j]) + kept * n)
+                change = _power(ONE - G * H[i, j]) - _power(ONE - H[i, j])
+                rise += times[i, j] * (s * change + max(kept - ONE, ZERO) * n)
+            left[number] += part
+            harm[number] += rise
+    return left, harm
 
 
 def decibels(before: float, after: float) -> float:

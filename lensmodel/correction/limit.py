@@ -20,7 +20,7 @@ from lensmodel.core.types import CHANNELS, Planes
 from lensmodel.correction.blur import ONE, ZERO, Mask, Number, Real, Sensor, UniformBlur
 from lensmodel.correction.richardson_lucy import LEAST_CLIPPED, compact
 from lensmodel.photo import LinearPhoto
-from lensmodel.photo.colour import curves_of, inverse
+from lensmodel.photo.colour import curves_of, encode, inverse
 
 _REACH: Final = 2
 """Radius of the light that bounds a pixel (chosen: within 1 only a line's blur, further another object)."""
@@ -415,9 +415,10 @@ class StoredColour:
         alone: the finest detail of red and blue is that of luma, and colour that a correction adds to it
         comes from rounding and from errors of the kernels, and shows as coloured pixels.
         """
-        before, change = np.empty(photo.shape, np.float32), np.empty(photo.shape, np.float32)
-        _values(photo, self.tables, before)
-        _values(restored, self.tables, change)
+        before, change = (
+            np.stack([encode(plane, table) for plane, table in zip(planes, self.tables, strict=True)])
+            for planes in (photo, restored)
+        )
         change -= before
         for axis in (-2, -1):
             change = ndimage.convolve1d(change, _FINEST, axis=axis, mode="nearest")
@@ -433,18 +434,6 @@ class StoredColour:
             for _ in range(size.bit_length() - 1):
                 chroma = ndimage.convolve1d(chroma, _PAIRED, axis=axis, mode="nearest")
         return chroma
-
-
-@jit
-def _values(planes: Planes, tables: Tables, out: Planes) -> None:
-    """File values of linear light, as `photo.colour.encode` finds them."""
-    for c in range(planes.shape[0]):
-        table = tables[c]
-        last = np.float32(table.size - 1)
-        for i in range(planes.shape[1]):
-            for j in range(planes.shape[2]):
-                light = min(max(planes[c, i, j], np.float32(0.0)), np.float32(1.0))
-                out[c, i, j] = table[np.int32(np.sqrt(light) * last + np.float32(0.5))]
 
 
 @jit

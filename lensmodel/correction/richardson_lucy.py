@@ -297,8 +297,6 @@ class Lights:
 
 def regions(lights: Mask, reach: int) -> list[tuple[Window, Mask]]:
     """Windows of a tile to estimate lights in, each with the light that it alone does, `reach` wider."""
-    if not lights.any():
-        return []
     near = ndimage.maximum_filter(np.pad(lights, reach), 2 * reach + 1)
     labels, count = ndimage.label(near)
     found = []
@@ -321,7 +319,8 @@ def compact(clipped: Mask, reach: int) -> Mask:
     if not clipped.any():
         return clipped
     # demosaicing leaves pixels between clipped ones hardly below saturation
-    closed = ndimage.binary_closing(np.pad(clipped, 1), np.ones((3, 3)))[1:-1, 1:-1] | clipped
+    dilated = ndimage.maximum_filter(np.pad(clipped, 1), 3)
+    closed = ndimage.minimum_filter(dilated, 3)[1:-1, 1:-1] | clipped
     depth = ndimage.distance_transform_cdt(np.pad(closed, 1), "chessboard")[1:-1, 1:-1]
     labels, count = ndimage.label(closed, structure=np.ones((3, 3), dtype=np.int8))
     broad = np.zeros(count + 1, dtype=np.bool_)

@@ -307,75 +307,55 @@ class SparseGradient:
     ) -> Solution:
         """Restore the colours together; see `restore_planes`."""
         lights = Lights.of(blurred, blurs, sensors, _LIGHT_STEPS)
-        rest, glow = (blurred, None) if lights is None else (lights.rest, lights.glow)
+        rest = blurred if lights is None else lights.rest
         light = np.maximum(rest.mean(axis=(1, 2)), 1e-4).astype(np.float32)
-        canvas = Canvas.around(blurred, blurs, surrounded=all(sensor.surrounded for sensor in sensors))
-        x, explained = self._solved(rest, blurs, sensors, light, canvas, glow)
-        inner = (slice(None), *canvas.data)
-        restored = x[inner] * light[:, None, None]
-        left = rest - explained[inner] * light[:, None, None]
-        clip = np.array([min(s.clip, 1e9) for s in sensors], dtype=np.float32)
-        clipped = blurred >= clip[:, None, None]
-        left[clipped] = 0.0
-        if any(sensor.measured is not None for sensor in sensors):
-            left = spread_grain(blurred, left, clipped, sensors, light)
-        return Solution(restored if lights is None else lights.put_back(blurred, restored), left)
-
-    def _solved(
-        self,
-        blurred: Planes,
-        blurs: Sequence[UniformBlur],
-        sensors: Sequence[Sensor],
-        light: Real,
-        canvas: Canvas,
-        glow: Planes | None,
-    ) -> tuple[Planes, Planes]:
-        """The planes on the canvas over their `light`, and what they make of the data, blurred again."""
-        recorded = blurred if glow is None else blurred + glow
-        var = np.stack(
-            [
-                sensor.noise.variance(_local_means(plane)) / bright**2
-                for sensor, plane, bright in zip(sensors, recorded, light, strict=True)
-            ]
-        ).astype(np.float32)
+        scale = light[:, None, None]
+        canvas = Canvas.around(rest, blurs, surrounded=all(sensor.surrounded for sensor in sensors))
+        recorded = rest if lights is None else rest + lights.glow
+        var = (
+            np.stack([s.variance(_local_means(p)) for s, p in zip(sensors, recorded, strict=True)]) / scale**2
+        )
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
-        luma = (blurred / light[:, None, None]).mean(axis=0)
+        luma = (rest / scale).mean(axis=0)
         mean = _local_means(luma)
         level = np.maximum(mean, _DARK)
-        local = _local_means(luma * luma) - mean * mean
-        relative = (var / noise[:, None, None]).mean(axis=0)
+        calm = _calm(_local_means(luma * luma) - mean * mean, level, var.mean(axis=0) / len(rest), self.alpha)
+        threshold = (var / noise[:, None, None]).mean(axis=0) * calm / level ** np.float32(self.alpha)
         power = np.float32(1.0 / (2.0 - self.alpha))  # of a threshold, for the scale of `shrinkage`
-        calm = _calm(local, level, var.mean(axis=0) / len(blurred), self.alpha)
-        threshold = relative * calm / level ** np.float32(self.alpha)
+        threshold = interpolated(threshold**power, BLOCK, canvas.rows, canvas.cols)
         couplings = self.coupling * self.growth ** np.arange(self.steps)
-        K, rates = transfers(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0)
-        variance = (blurred.reshape(len(blurred), -1).var(axis=1) / light**2).astype(np.float32)
+        K, rates = transfers(blurs, canvas.shape, max(rest.shape[1:]) / 2.0)
+        variance = (rest.reshape(len(rest), -1).var(axis=1) / light**2).astype(np.float32)
         mosaic = any(sensor.measured is not None for sensor in sensors)
-        weights = np.full(len(blurred), self.mosaic_weight if mosaic else self.weight, dtype=np.float64)
-        if not mosaic and glow is None:
+        weights = np.full(len(rest), self.mosaic_weight if mosaic else self.weight, dtype=np.float64)
+        if not mosaic and lights is None:
             # beside removed lights the rest is no natural scene: the prior keeps its weight
             weights *= _reliance(K[1], canvas.shape, noise[1], variance[1])
         weights[1:] *= self.chroma
-        y = fill_canvas(canvas, blurred, light, K, blurs, sensors, _LIGHT_STEPS)
+        y = fill_canvas(canvas, rest, light, K, blurs, sensors, _LIGHT_STEPS)
         if mosaic:
             refill(y, K, noise, variance, sensors, canvas)
-        start = np.stack([wiener_spectrum(*each) for each in zip(y, K, noise, variance, strict=True)])
-        return half_quadratic(
+        x, explained = half_quadratic(
             y,
             _known(sensors, canvas),
             K,
             noise,
-            start,
+            np.stack([wiener_spectrum(*each) for each in zip(y, K, noise, variance, strict=True)]),
             _gradient_power(canvas.shape),
-            canvas.filled(
-                interpolated(threshold**power, BLOCK, canvas.rows, canvas.cols)[None], np.ones(1, np.float32)
-            )[0],
+            canvas.filled(threshold[None], np.ones(1, dtype=np.float32))[0],
             (weights[None, :] / couplings[:, None]).astype(np.float32) ** power,
             couplings.astype(np.float32),
             _OPPONENT,
             shrinkage(self.alpha),
             (rates, *_from_middle(canvas, blurs[0])),
         )
+        restored = x[:, *canvas.data] * scale
+        left = rest - explained[:, *canvas.data] * scale
+        clipped = blurred >= np.array([[[min(s.clip, 1e9)]] for s in sensors], dtype=np.float32)
+        left[clipped] = 0.0
+        if mosaic:
+            left = spread_grain(blurred, left, clipped, sensors, light)
+        return Solution(restored if lights is None else lights.put_back(blurred, restored), left)
 
 
 def _from_middle(canvas: Canvas, blur: UniformBlur) -> tuple[Real, Real]:

@@ -345,14 +345,12 @@ def tell_of_compiling() -> None:
     """Log once when Numba compiles; loading from its cache does not count."""
 
     class CompilationLog(event.Listener):
-        logged = False
+        tell = staticmethod(cache(first_use.info))  # once
 
         def on_start(self, started: object) -> None:
             del started
-            if not self.logged:
-                self.logged = True
-                # as long as on a usual machine, lest the silence look like a fault
-                first_use.info("compiling the inner loops, once on this machine: about 30 s")
+            # as long as on a usual machine, lest the silence look like a fault
+            self.tell("compiling the inner loops, once on this machine: about 30 s")
 
         def on_end(self, ended: object) -> None:
             """The progress display shows the end."""

@@ -66,21 +66,12 @@ class Lens:
     sensor that the lens was calibrated on.
 
     Lenses are values: nothing changes one. Make them with `calibrate`, `Lens.from_kernels` or `Lens.load`.
-
-    Parameters
-    ----------
-    model : LensModel
-        The function behind the answers.
-    names, photos : mapping of str
-        What is known of maker, model, serial and label; and file names by the id that samples carry.
-    cameras : tuple of Camera
-        What the photos were taken with, each once; empty where none says.
     """
 
-    model: LensModel
-    names: Mapping[str, str] = field(default_factory=dict)
-    photos: Mapping[str, str] = field(default_factory=dict)
-    cameras: tuple[Camera, ...] = ()
+    model: LensModel  # the function behind the answers
+    names: Mapping[str, str] = field(default_factory=dict)  # what is known of maker, model, serial and label
+    photos: Mapping[str, str] = field(default_factory=dict)  # file names by the id that samples carry
+    cameras: tuple[Camera, ...] = ()  # what the photos were taken with, each once; empty where none says
 
     def __repr__(self) -> str:
         return f"<Lens: {self.description}, {len(self.samples)} samples>"
@@ -150,15 +141,9 @@ class Lens:
     ) -> PsfAnswer:
         """Return the PSF at one place, with how much stands behind it; warns if no photo shows the place.
 
-        Parameters
-        ----------
-        r, phi : float
-            Field position: half diagonals 0..1, and radians.
-        size : int
-            Odd side of the kernel in pixels.
-        **settings
-            `aperture`, the f-number, where None takes all apertures of the samples together; the same goes
-            for `focal_mm` in mm and `focus_m` in metres. `channel`, "r", "g" (default) or "b".
+        `r` is in half diagonals 0..1, `phi` in radians, `size` the odd side of the kernel in pixels. Settings
+        are `aperture`, the f-number, where None takes all apertures of the samples together, and so on for
+        `focal_mm` in mm and `focus_m` in metres; and `channel`, "r", "g" (default) or "b".
         """
         answer = self.model.query(FieldPosition(r, phi), LensSettings(**settings), size)
         if answer.extrapolated:

@@ -36,12 +36,9 @@ from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Kernel, NoiseModel, block_means
 
 Array: TypeAlias = NDArray[np.float64]
-Box = tuple[int, int, int, int]
-"""(row, col, height, width) in pixels of the frame."""
+Box = tuple[int, int, int, int]  # (row, col, height, width) in pixels of the frame
 
-OVERSAMPLING: Final = 4
-"""Bins a pixel of the edge spread function."""
-
+OVERSAMPLING: Final = 4  # bins a pixel of the edge spread function
 _MIN_SIDE: Final = 16  # pixels (chosen): over it an edge of 2 degrees moves by half a pixel
 _MIN_ROWS: Final = 10  # that a line is fitted to: fewer do not tell which of them is off (chosen)
 _REACH: Final = 48.0  # pixels of edge spread on each side; more only adds noise
@@ -268,14 +265,11 @@ def mtf50_from_kernel(kernel: Kernel, angle: float) -> float:
 
 # --- finding the edges ---
 
-SIDES: Final = (128, 96, 64)
-"""Sides of a window in pixels: the largest that holds the edge and nothing else is taken."""
-
-LEAST_ON_A_CHART: Final = 4
-"""Edges that a photo must have, along its rows and along its columns: other scenes have one or two."""
-
+_SIDES: Final = (128, 96, 64)  # of a window in pixels: the largest that holds an edge alone is taken
+# Edges that a photo must have, along its rows and along its columns: other scenes have one or two
+_LEAST_ON_A_CHART: Final = 4
 _MEAN: Final = 4  # pixels along the side of a mean
-_WINDOW: Final = SIDES[-1] // _MEAN  # of the smallest crop, in means of pixels
+_WINDOW: Final = _SIDES[-1] // _MEAN  # of the smallest crop, in means of pixels
 _STRIDE: Final = _WINDOW // 4  # a quarter of a window: no edge is missed between two (chosen)
 _LEAST_STEP: Final = 0.02  # of full scale
 _LEAST_COHERENCE: Final = 0.9  # of the structure tensor: one straight edge and nothing else (chosen)
@@ -314,27 +308,27 @@ def find_edges(
     Each is given once, by the largest box in its middle that holds nothing else; none where there are fewer
     than four, or none across the others: such a photo shows no chart.
     """
-    if min(plane.shape) < SIDES[-1]:
+    if min(plane.shape) < _SIDES[-1]:
         return ()
     found: list[FoundEdge] = []
     with np.errstate(all="ignore"):  # light beyond what float32 can square is no edge
         segments = _segments(block_means(np.asarray(plane, dtype=np.float32), _MEAN))
     for number, ends in enumerate(segments[:_TRIED]):
-        if number == _FIRST and len(found) < LEAST_ON_A_CHART:
+        if number == _FIRST and len(found) < _LEAST_ON_A_CHART:
             return ()
         if (edge := _edge_on(plane, ends, noise, clip)) is not None:
             found.append(edge)
     usual = float(np.median([edge.response.step for edge in found])) if found else 0.0
     edges = tuple(edge for edge in found if edge.response.step > _LEAST_OF_USUAL * usual)
     upright = [abs(math.cos(edge.response.normal)) > math.sqrt(0.5) for edge in edges]
-    chart = len(edges) >= LEAST_ON_A_CHART and any(upright) and not all(upright)
+    chart = len(edges) >= _LEAST_ON_A_CHART and any(upright) and not all(upright)
     return edges if chart else ()
 
 
 def _edge_on(plane: NDArray[np.floating], ends: Array, noise: NoiseModel, clip: float) -> FoundEdge | None:
     """Measure an edge between two ends in its middle, or beside it where the middle is spoilt."""
     for share in (0.5, 0.25, 0.75):
-        for side in SIDES:
+        for side in _SIDES:
             top, left = (round(at) - side // 2 for at in ends[0] + share * (ends[1] - ends[0]))
             if min(top, left) < 0 or top + side > plane.shape[0] or left + side > plane.shape[1]:
                 continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -65,12 +66,9 @@ def measured(profile: Path, aperture: float | None) -> LensReport:
     names, cameras = known.names, [camera_name(camera.maker, camera.model) for camera in known.cameras]
     with files.as_usage():
         LensSettings(aperture=aperture)
-        return lens_report(
-            known.model,
-            names.get("label") or full_name(names.get("maker"), names.get("model")) or profile.stem,
-            apertures=None if aperture is None else [aperture],
-            details=provenance(names.get("serial"), cameras, list(known.photos.values())),
-        )
+        name = names.get("label") or full_name(names.get("maker"), names.get("model")) or profile.stem
+        found = lens_report(known.model, name, apertures=None if aperture is None else [aperture])
+    return replace(found, details=provenance(names.get("serial"), cameras, list(known.photos.values())))
 
 
 def _targets(output: Path | None) -> tuple[Path, ...]:

@@ -89,21 +89,19 @@ class LearnedField:
         own = self._usual_pitch
         if own is not None and pitch_um is not None and self._of_pitch(pitch_um).any():
             own = pitch_um
-        cell = np.round(query.in_units(query.point(position, settings)) / _CELL)
-        steps = tuple(None if np.isnan(step) else float(step) for step in cell)
-        rows, memory, kind = self._memory(own, () if len(self._tree(own)[0]) <= NEAREST else steps)
-        asked = conditions_of(settings, own, kind)
-        return self.network.query(memory, np.array(position.xy), asked), rows, own
+        asked = query.in_units(query.point(position, settings))
+        cell = np.round(np.where(np.isnan(asked), self._usual, asked) / _CELL).tolist()
+        rows, memory, kind = self._memory(own, () if len(self._tree(own)[0]) <= NEAREST else tuple(cell))
+        conditions = conditions_of(settings, own, kind)
+        return self.network.query(memory, np.array(position.xy), conditions), rows, own
 
     def _memory_of(
-        self, pitch_um: float | None, cell: tuple[float | None, ...]
+        self, pitch_um: float | None, cell: tuple[float, ...]
     ) -> tuple[NDArray[np.intp], Memory, PatchKind]:
         """Samples near a cell of places, or all; their keys and values; the usual kind of files."""
         rows, tree = self._tree(pitch_um)
         if cell:
-            middle = np.array(cell, dtype=np.float64) * _CELL
-            near = tree.query(np.where(np.isnan(middle), self._usual, middle), k=NEAREST)[1]
-            rows = rows[np.sort(near)]
+            rows = rows[np.sort(tree.query(np.array(cell) * _CELL, k=NEAREST)[1])]
         tokens = self._tokens[rows].astype(np.float32)
         memory = self.network.memory(tokens, self._xy[rows], self._conditions[rows])
         return rows, memory, KINDS[int(np.bincount(self._conditions[rows, -1].astype(int)).argmax())]

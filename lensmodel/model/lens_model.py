@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -48,6 +47,10 @@ class LensModel:
         self._regression = before if before is not None and before.samples == kernels else None
         if kernels and self._regression is None:
             self._regression = Regression(kernels, mode)
+        # Fingerprint of the weights of the network, empty where none takes part
+        self.weights = "" if self._attention is None else self._attention.network.name
+        # Of the pixels that answers are for unless others are asked for, None where no sample knows
+        self.pitch_um = camera_bodies.usual_pitch(samples)
         self._answering = [part for part in (self._attention, self._regression) if part is not None]
 
     @classmethod
@@ -63,12 +66,7 @@ class LensModel:
         return LensModel(placed, self.mode, self._regression)
 
     def query(
-        self,
-        position: FieldPosition,
-        settings: LensSettings,
-        size: int = 55,
-        *,
-        pitch_um: float | None = None,
+        self, position: FieldPosition, settings: LensSettings, size: int = 55, pitch_um: float | None = None
     ) -> PsfAnswer:
         """Return the PSF at a place, of odd side `size`, with what stands behind it.
 
@@ -99,7 +97,6 @@ class LensModel:
         positions: Sequence[FieldPosition],
         settings: LensSettings,
         size: int = 55,
-        *,
         pitch_um: float | None = None,
     ) -> Array:
         """Return the kernels of `query` of many places, (n, size, size); a regression alone is faster."""
@@ -117,16 +114,6 @@ class LensModel:
         if pitch_um is not None and not (math.isfinite(pitch_um) and pitch_um > 0):
             raise InvalidInputError(f"the pixel pitch must be positive micrometres, got {pitch_um}")
         return self.pitch_um if pitch_um is None else pitch_um
-
-    @property
-    def weights(self) -> str:
-        """Fingerprint of the weights of the network; empty where none takes part."""
-        return "" if self._attention is None else self._attention.network.name
-
-    @cached_property
-    def pitch_um(self) -> float | None:
-        """Pixel pitch that answers are for unless another is asked for; None where no sample knows."""
-        return camera_bodies.usual_pitch(self.samples)
 
     def coverage(self) -> dict[Zone, int]:
         """Number of green samples in each zone."""

@@ -43,7 +43,7 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.special import erf, softmax
 
-from lensmodel.core.errors import InvalidInputError, NoSamplesError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
 from lensmodel.core.psf import KINDS, PatchKind
 from lensmodel.core.types import LensSettings, Plane
@@ -484,8 +484,6 @@ class FieldNetwork:
         self, tokens: NDArray[np.floating], xy: NDArray[np.floating], conditions: NDArray[np.float64]
     ) -> Memory:
         """Keys and values of samples (n, d) of any photos; `conditions` are of each, or of all."""
-        if not len(tokens):
-            raise NoSamplesError("no sample of the lens; calibrate it with photos first")
         tokens = np.asarray(tokens, np.float32)
         pairs = [self._keys(block, tokens) for block in self._blocks("decoder")]
         keys, values = (np.stack(parts) for parts in zip(*pairs, strict=True))

@@ -72,8 +72,7 @@ _ERRORS: Final = 2.0
 _MEASURED: Final = 0.15
 _SCALE: Final = np.linspace(0.0, 1.0, 513)  # cycles/pixel
 _TURNS: Final = (0.0, math.pi / 2.0)  # from u, to what is tangential and sagittal
-Range: TypeAlias = tuple[float, float]
-"""Between what MTF50 is expected, cycles/pixel."""
+Range: TypeAlias = tuple[float, float]  # between what MTF50 is expected, cycles/pixel
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +209,8 @@ class LensReport:
     @property
     def facts(self) -> str:
         """What it rests on, in words."""
-        facts = f"{_counted(self.photos, 'photo')}, blur measured at {_counted(self.places, 'place')}"
+        facts = f"{self.photos} photo{'s' * (self.photos != 1)}"
+        facts += f", blur measured at {self.places} place{'s' * (self.places != 1)}"
         if (pitch := self.sensor.pixel_pitch_um) is not None:
             facts += f", pixels of {pitch:.2f} micrometres, Nyquist frequency {500.0 / pitch:.0f} lp/mm"
         return facts
@@ -235,10 +235,6 @@ class LensReport:
         guesses = f"Too little is known of {share:.0%} of the picture; those figures are guesses."
         lines = (self.verdict, guesses if share else "", self.details.get(_CAUTION, ""), self.advice)
         return tuple(filter(None, lines))
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def caution(photos: Sequence[str]) -> str:
@@ -268,7 +264,6 @@ def lens_report(
     apertures: Sequence[float] | None = None,
     rows: int = _ROWS,
     size: int = 31,
-    details: Mapping[str, str] | None = None,
     on_step: types.StepHook = types.ignore_step,
 ) -> LensReport:
     """Report on a lens at the apertures of its photos, or at those that are given.
@@ -310,7 +305,6 @@ def lens_report(
         places=places_of(model.samples),
         sensor=SensorGeometry(pitch, height_px),
         tested=tuple(tested),
-        details=dict(details or {}),
     )
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 from scipy import ndimage
 
 from lab.population.sets import adjusted, judge, load_sets
-from lensmodel.core.errors import InvalidInputError, NoSamplesError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import LensSettings
 from lensmodel.neural.network import (
     LENGTH,
@@ -145,11 +145,6 @@ def test_told_error_grows_where_samples_are_few_far_or_noisy() -> None:
     assert np.mean([told(statistics[4:5], PLACES[4:5]) for statistics in photos]) > all_of_them
     assert far > near
     assert noisy > all_of_them
-
-
-def test_no_samples_are_refused() -> None:
-    with pytest.raises(NoSamplesError, match="calibrate"):
-        FieldNetwork.load().memory(np.empty((0, 192)), np.empty((0, 2)), WIDE_OPEN)
 
 
 def test_statistics_of_a_wrong_shape_or_not_finite_are_refused(sharp: np.ndarray) -> None:

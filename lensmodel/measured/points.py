@@ -51,16 +51,18 @@ class Points(Measurer):
 
     def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
         """Find points that are alone and unsaturated, by the cells of the frame."""
-        photo = photos[0]
-        plane = np.asarray(photo.planes[1], dtype=np.float64)
-        spots = find_lights(plane)
+        photo, half = photos[0], size // 2 + 1
+        height, width = photo.planes.shape[1:]
+        spots = find_lights(np.asarray(photo.planes[1], dtype=np.float64))
         lights = isolated_lights(spots, size)
-        usable = [(row, col) for row, col, _ in lights if _is_usable(photo, row, col, size)]
-        cells: dict[tuple[int, int], list[tuple[float, float]]] = {}
-        for row, col in usable:
-            cell = int(row * self.down / photo.frame.height), int(col * self.across / photo.frame.width)
-            cells.setdefault(cell, []).append((row, col))
-        good = [cell for cell in cells.values() if len(cell) >= _FEWEST]
+        rows, cols = np.rint(lights[:, :2].T).astype(int)
+        limits = NEAR_CLIP * np.array(photo.clip, dtype=np.float32)[:, None, None]
+        clipped = ndimage.maximum_filter((photo.planes >= limits).any(axis=0), 7)[rows, cols]
+        whole = (rows >= half) & (rows < height - half) & (cols >= half) & (cols < width - half)
+        usable = lights[whole & ~clipped, :2]
+        number = (usable * (self.down / height, self.across / width)).astype(int) @ (self.across, 1)
+        cells = [usable[number == cell][:_MOST] for cell in np.unique(number)]
+        good = [cell for cell in cells if len(cell) >= _FEWEST]
         if len(lights) < _ISOLATED * len(spots):
             raise NotEnoughEvidenceError(
                 f"of {len(spots)} bright spots only {len(lights)} are isolated: this is no photo of points "
@@ -77,19 +79,7 @@ class Points(Measurer):
         def sky(channel: Channel) -> NDArray[np.float64]:
             return sky_of(np.asarray(photo.planes[CHANNELS.index(channel)], np.float64))[0]
 
-        return good, lambda cell, channel: _cell_psf(
-            photo, channel, np.array(cell[:_MOST]), size, sky(channel)
-        )
-
-
-def _is_usable(photo: LinearPhoto, row: float, col: float, size: int) -> bool:
-    """Whether the window of a light lies in the frame, and nothing near it is saturated."""
-    half, (height, width) = size // 2 + 1, photo.planes.shape[1:]
-    if not (half <= row < height - half and half <= col < width - half):
-        return False
-    top, left = max(round(row) - 3, 0), max(round(col) - 3, 0)
-    near = photo.planes[:, top : round(row) + 4, left : round(col) + 4]
-    return all(bool((plane < NEAR_CLIP * clip).all()) for plane, clip in zip(near, photo.clip, strict=True))
+        return good, lambda cell, channel: _cell_psf(photo, channel, cell, size, sky(channel))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,32 +125,30 @@ def _cell_psf(
     level = np.maximum(behind.mean(axis=(1, 2), keepdims=True), 0.0)
     parts = observed, measured, level, pixels - corners, fluxes
     lights = _Lights(windows[0].noise, *(part[seen] for part in parts))
-    solved = _stacked(lights, None)
-    left = _unexplained(lights, solved)
+    solved, left = _stacked(lights, None)
     for _ in range(_ROUNDS - 1):
         # sharper than pixels, lights are no sums of sincs, and the centres that suit sincs best are wrong
         moved = _refined(lights, solved.kernel)
-        again = _stacked(moved, solved.kernel)
-        if (rest := _unexplained(moved, again)) >= left:
+        again, rest = _stacked(moved, solved.kernel)
+        if rest >= left:
             break
         lights, solved, left = moved, again, rest
     middle = np.average(pixels[seen], axis=0, weights=lights.fluxes)
     return Found(centred(solved.kernel), math.hypot(solved.error, left), middle)
 
 
-def _stacked(lights: _Lights, kernel: NDArray[np.float64] | None) -> Solved:
-    """Solve for the kernel of all lights at once; that of the round before tells the noise of each pixel."""
-    size = lights.observed.shape[1]
+def _stacked(lights: _Lights, kernel: NDArray[np.float64] | None) -> tuple[Solved, float]:
+    """Solve for the kernel of all lights at once; say also what it leaves of them beyond their noise, in L2.
+
+    The kernel of the round before tells the noise of each pixel.
+    """
+    size, good = lights.observed.shape[1], lights.measured
     even = np.broadcast_to(lights.fluxes[:, None, None] / size**2, lights.observed.shape)
     variance = lights.variance(even if kernel is None else lights.blurred(kernel))
-    return solve(lights.observed, lights.latent(), lights.measured, variance, size)
-
-
-def _unexplained(lights: _Lights, solved: Solved) -> float:
-    """Return what a kernel leaves of the lights beyond their noise, as a relative L2."""
-    light, good = lights.blurred(solved.kernel * solved.light), lights.measured
+    solved = solve(lights.observed, lights.latent(), good, variance, size)
+    light = lights.blurred(solved.kernel * solved.light)
     rest = float((np.square(lights.observed - light) - lights.variance(light))[good].sum())
-    return math.sqrt(max(rest, 0.0) / float(np.square(lights.observed[good]).sum()))
+    return solved, math.sqrt(max(rest, 0.0) / float(np.square(lights.observed[good]).sum()))
 
 
 def _refined(lights: _Lights, kernel: NDArray[np.float64]) -> _Lights:

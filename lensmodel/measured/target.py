@@ -204,13 +204,7 @@ class Target(Measurer):
         height, width = photo.planes.shape[1:]
         down = min(self.down, max(height // (3 * self.side // 4), 2))
         across = min(self.across, max(width // (3 * self.side // 4), 2))
-        held = [
-            corner
-            for corner in measurer.window_corners(
-                (height, width), self.side, _TRIED * across, _TRIED * down, 0
-            )
-            if placed.holds(*corner, self.side, size // 2)
-        ]
+        held = placed.corners(self.side, _TRIED * across, _TRIED * down, size // 2)
         if not held:
             raise NotEnoughEvidenceError(_TOO_SMALL)
         corners = _spread(held, across, down)
@@ -220,8 +214,8 @@ class Target(Measurer):
 
         def psf_in(corner: tuple[int, int], channel: Channel) -> Found:
             window = Window.of(photo, channel, corner, self.side)
-            kernel, error, *_ = _solved(window, placed, size)
-            return Found(kernel, error, window.middle)
+            solved, *_ = _solved(window, placed, size)
+            return Found(solved.kernel, solved.error, window.middle)
 
         return corners, psf_in
 
@@ -229,8 +223,7 @@ class Target(Measurer):
         """Find the page in a photo and register it to a fraction of a pixel."""
         plane, side = np.asarray(photo.planes[1]), self.side
         placed = self._identified(photo, on_step)
-        corners = measurer.window_corners(plane.shape, side, 12, 8, 0)
-        corners = [corner for corner in corners if placed.holds(*corner, side, 0)]
+        corners = placed.corners(side, 12, 8, 0)
         warp = placed.warp
 
         def shown(bent: Warp, corner: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float32]:
@@ -308,16 +301,20 @@ class PlacedPage:
         inner = plane[_SPARE : _SPARE + shape[0], _SPARE : _SPARE + shape[1]]
         return np.ascontiguousarray(inner + MEAN, dtype=np.float32)
 
-    def holds(self, row: int, col: int, side: int, margin: int) -> bool:
-        """Whether a window of the photo, with its margin, shows noise and nothing else."""
-        steps = np.linspace(-margin, side - 1 + margin, 9)
-        return self.page.holds_noise(*self.warp(*np.meshgrid(row + steps, col + steps, indexing="ij")))
+    def corners(self, side: int, across: int, down: int, margin: int) -> list[tuple[int, int]]:
+        """Corners of the windows spread over the photo that show noise and nothing else, with a margin."""
+        steps, frame = np.linspace(-margin, side - 1 + margin, 9), self.warp.frame
+        return [
+            (row, col)
+            for row, col in measurer.window_corners((frame.height, frame.width), side, across, down, 0)
+            if self.page.holds_noise(*self.warp(*np.meshgrid(row + steps, col + steps, indexing="ij")))
+        ]
 
 
 def _solved(
     window: Window, placed: PlacedPage, size: int
-) -> tuple[Kernel, float, tuple[float, float], NDArray[np.float64]]:
-    """Kernel of a window of the page, its error, how far the page was moved, and terms (6,) of its light."""
+) -> tuple[measurer.Solved, tuple[float, float], NDArray[np.float64]]:
+    """Kernel of a window of the page, how far the page was moved, and terms (6,) of its light."""
     (row, col), side = window.corner, len(window.light)
 
     def page(shift: tuple[float, float], margin: int) -> NDArray[np.float32]:
@@ -331,7 +328,7 @@ def _solved(
     rough, shift = measurer.roughly(window, lit)
     light = _fitted_light(window, page(shift, SMALL // 2), rough)
     solved, shift = measurer.window_psf(window, lit, size, varying=True)
-    return solved.kernel, solved.error, shift, light
+    return solved, shift, light
 
 
 def _tones_of(
@@ -361,11 +358,11 @@ def _tones_of(
 def _tones_in(window: Window, placed: PlacedPage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Precision (2, 2) and value (2,) of (q, c) in one window."""
     side, half, (row, col), good = len(window.light), SMALL // 2, window.corner, window.measured
-    kernel, _, shift, terms = _solved(window, placed, SMALL)
+    solved, shift, terms = _solved(window, placed, SMALL)
     light, outer = measurer.window_terms(side, half) @ terms, (side + 2 * half,) * 2
     start = row - half - shift[0], col - half - shift[1]
     pages = [replace(placed, tones=tones).window(*start, outer) * light for tones in _POWERS]
-    basis, terms = _explained(window, pages, kernel)
+    basis, terms = _explained(window, pages, solved.kernel)
     if not terms[0] > 0.0:
         raise NotEnoughEvidenceError("a window shows a negative of the page")
     left = float(np.square(window.light[good] - basis @ terms).sum()) / max(len(basis) - terms.size, 1)

@@ -270,7 +270,7 @@ def _shortlist(windows: Windows) -> list[int]:
 def _spread(windows: Windows, count: int) -> list[list[int]]:
     """Choose up to `count` windows, given best first, and group them by field cells.
 
-    First the seeds, one a cell; then every cell in turn takes its best remaining neighbour, up to four.
+    First the seeds, one a cell; then the smallest cell takes its best remaining neighbour, up to four.
     """
     rows, cols, r, phi = (
         part[:, None] - part for part in (windows.rows, windows.cols, windows.r, windows.phi)
@@ -281,25 +281,14 @@ def _spread(windows: Windows, count: int) -> list[list[int]]:
     of_one_cell = close & (abs(r) <= CELL_R)
     # Half a window's distance between any two chosen; a whole one between the seeds, if there is room.
     cells = [[seed] for seed in _seeds(windows, apart, math.ceil(count / PATCHES_A_CELL))]
-    left, free = count - len(cells), (apart[[seed for (seed,) in cells]] >= 0.5).all(axis=0)
-
-    def best(among: NDArray[np.bool_]) -> int | None:
-        nonlocal left
-        found = np.flatnonzero(free & among)
-        if not (found.size and left):
-            return None
-        left -= 1
-        free[apart[found[0]] < 0.5] = False
-        return int(found[0])
-
-    for cell in cells * (MOST_A_CELL - 1):
-        if (window := best(of_one_cell[cell[0]])) is not None:
-            cell.append(window)
-    while (window := best(free)) is not None:  # one that is near no cell founds its own
-        near = (cell for cell in cells if len(cell) < MOST_A_CELL and of_one_cell[cell[0], window])
-        if (home := next(near, None)) is None:
+    free = (apart[[seed for (seed,) in cells]] >= 0.5).all(axis=0)
+    while sum(map(len, cells)) < count and free.any():
+        room = (cell for cell in cells if len(cell) < MOST_A_CELL and (free & of_one_cell[cell[0]]).any())
+        if (home := min(room, key=len, default=None)) is None:  # what is near no cell founds its own
             cells.append(home := [])
-        home.append(window)
+        near = of_one_cell[home[0]] if home else free
+        home.append(int(np.argmax(free & near)))
+        free &= apart[home[-1]] >= 0.5
     return cells
 
 

@@ -66,11 +66,6 @@ def r_map(plane: Plane) -> Plane:
     return r_of_gradients(along_rows, along_cols, np.hypot(along_rows, along_cols), 1.0)
 
 
-def r_bin(r: Plane) -> NDArray[np.intp]:
-    """Number of the r-bin of each value, 0 to R_BINS - 1."""
-    return np.minimum((r * R_BINS).astype(np.intp), R_BINS - 1)
-
-
 def automatic_threshold(histogram: NDArray[np.int64], pixels: int, kernel_pixels: int) -> int:
     """Highest r-bin from which on 0.5 sqrt(N_I N_k) pixels of each direction lie (Xu and Jia, sec. 3.1)."""
     wanted = 0.5 * math.sqrt(float(pixels) * float(kernel_pixels))
@@ -205,7 +200,7 @@ def _strip_sums(
     gr_at, gc_at = gr.ravel()[edges], gc.ravel()[edges]
     turn = np.arctan2(gr_at, gc_at) * (ORIENTATIONS / np.pi)  # 0 is along columns, growing downwards
     orientation = np.floor(turn + 0.5).astype(np.intp) % ORIENTATIONS
-    r_bins = r_bin(r[inner].ravel()[edges])
+    r_bins = np.minimum((r[inner].ravel()[edges] * R_BINS).astype(np.intp), R_BINS - 1)
 
     def by_bin(bins: NDArray[np.intp] | int, count: int, weights: NDArray[np.float32]) -> NDArray[Any]:
         return np.bincount(block[edges] * count + bins, weights, n * m * count).reshape(n, m, count)

@@ -99,10 +99,7 @@ class LearnedEstimator:
         size: int = 31,
         green: PsfEstimate | None = None,
     ) -> PsfEstimate:
-        """Estimate the kernel that patches of one plane share, as if all colors of a mosaic were that plane.
-
-        The middle 128 pixels of a patch are used; a smaller one is continued by its mirror image.
-        """
+        """Estimate the kernel that the middles of patches share, as if a whole mosaic were their plane."""
         kept = usable(patches, noise, size)
         network, conditions = FieldNetwork.load(), conditions_of(types.LensSettings(), None)
         colours = _colours(_MOSAIC, 0, 0)

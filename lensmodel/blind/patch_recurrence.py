@@ -64,11 +64,9 @@ def noise_gain(shape: tuple[int, int], target: tuple[int, int]) -> float:
 
 
 def recur(x: Image, noise: float, bandwidth: float) -> Image:
-    """Replace every patch by the mean of its best matches in the smaller copy of the picture.
+    """Replace patches by the means of their best matches in the smaller copy of the picture.
 
     z = (1/M²) sum_j Q_j' sum_i w_ij R_i x^a,  w_ij ~ exp(-|Q_j x - R_i x^a|² / (2 h²))
-
-    Patches are compared without their mean, which is kept. Flat ones become their mean.
     """
     smaller = resized_image(x, (round(x.shape[0] / ALPHA), round(x.shape[1] / ALPHA)))
     examples = sliding_window_view(smaller, (SIDE, SIDE)).reshape(-1, SIDE * SIDE)

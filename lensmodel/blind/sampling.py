@@ -177,11 +177,7 @@ def estimate_cell(
     size: int = DEFAULT_KERNEL_SIZE,
     on_step: StepHook = ignore_step,
 ) -> list[PsfSample]:
-    """Estimate the PSF of one field cell in each channel, green first, of a photo or the folder of one.
-
-    The patches of a cell share one kernel, and their weights add up to one; an estimator of whole
-    photos has all patches in one cell and gives each its own.
-    """
+    """Estimate the kernel that the patches of a field cell share in each channel, green first."""
     developed = load_developed(developed) if isinstance(developed, Path) else developed
     method = estimators.resolve(estimator)
     if isinstance(method, PhotoEstimator):
@@ -231,15 +227,12 @@ class CalibrationEvent:
     Parameters
     ----------
     photo : Path
-        Its file.
     stage : {"developing", "selecting", "estimating", "counted", "skipped"}
         The last two end the work on a photo.
     done, total : int
         Patches, while estimating; else 0.
-    detail : str
-        Why a photo was skipped.
-    error : Exception or None
-        What was raised where a photo cannot be used; None where the lens knows it already.
+    detail, error : str, Exception or None
+        Why a photo was skipped, and what was raised; nothing where the lens knows it already.
     """
 
     photo: Path

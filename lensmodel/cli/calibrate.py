@@ -53,8 +53,6 @@ def calibrate(
 
         lensmodel calibrate holiday --profile my-24mm.lensprofile
 
-        lensmodel calibrate holiday one-more.dng --profile my-24mm.lensprofile --workers 1
-
         lensmodel calibrate scan.tif --aperture 2.8 --profile old-lens.lensprofile
 
     Exit status: 0 all photos counted, 1 some did not, 2 wrong usage.
@@ -104,10 +102,7 @@ CONNECT_S = 10.0
 
 @contextmanager
 def executor_of(scheduler: str | None) -> Iterator[tuple[Executor | None, int]]:
-    """Give the executor of a cluster, and how many photos to send ahead; None without a cluster.
-
-    Only the bytes of photos and the samples travel: the machines need lensmodel, and none of the files.
-    """
+    """Give the executor of a cluster, and how many photos to send ahead, as bytes; None without a cluster."""
     if scheduler is None:
         yield None, AHEAD
         return

@@ -143,10 +143,7 @@ def leave_interrupts_to_the_command() -> None:
 
 
 def handle_signals() -> None:
-    """Turn Ctrl-C and SIGTERM into `InterruptedByUser`: each `with` and `finally` removes what is unfinished.
-
-    Worker processes are killed first: pools wait for what they began.
-    """
+    """Turn Ctrl-C and SIGTERM into `InterruptedByUser`: each `with` and `finally` removes what is begun."""
     for number in _SIGNALS:
         signal.signal(number, _stop)
 

@@ -373,10 +373,7 @@ def _name(said: PhotoMetadata, taken: Collection[str], *, focal: bool) -> str:
 
 
 def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[str, Any]:
-    """Learn the lens of every group of photos, correct those that gain, and tell what became of each.
-
-    Lens profiles go to `profiles`; each group is learned from `most` photos.
-    """
+    """Learn the lens of each group from `most` photos, correct those that gain, and tell of each."""
     shots: list[Shot] = []
     results: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []

@@ -20,10 +20,7 @@ _PART_OF_SHOT: Final = re.compile(r"\.RAW-\d+(\.[A-Z]+)*$", re.IGNORECASE)
 
 
 def photos(names: Iterable[Path], note: Callable[[str], None]) -> list[Path]:
-    """Turn files and folders into a list of photos without repeats; note what is passed over in folders.
-
-    Of one shot the RAW file counts, and no other picture of it. Of folders, corrected photos are left out.
-    """
+    """Turn files and folders into photos, of one shot the RAW file; note what is passed over."""
     unique: dict[Path, None] = {}
     for path in names:
         if path.is_dir():
@@ -77,11 +74,7 @@ def profile_at(path: Path) -> Lens:
 
 
 class ProfileFile(LensStore):
-    """The store of a lens in a file.
-
-    Another run may add to the same file meanwhile: the profile is read again whenever the file has
-    changed, so that no run drops what another one learned.
-    """
+    """The store of a lens in a file, read again when another run changed it, which loses nothing so."""
 
     def __init__(self, target: Path, model: str | None = None, *, force: bool = False) -> None:
         super().__init__()

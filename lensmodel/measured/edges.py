@@ -131,10 +131,9 @@ class _Line(NamedTuple):
 
 
 def _line(photo: LinearPhoto, channel: Channel, edge: FoundEdge) -> _Line:
-    """Measure an edge; raises where that fails. Phases are 0 at the middle of the light.
+    """Measure an edge by the transform of its profile's derivative; raises where that fails.
 
-    The derivative of the profile, tapered where only noise is left, transformed; what the difference over
-    two bins and the bins themselves take off is put back, as `quality` does.
+    What the difference over two bins and the bins themselves take off is put back, as `quality` does.
     """
     row, col, side, _ = edge.box
     window = Window.of(photo, channel, (row, col), side)
@@ -159,10 +158,7 @@ _Misfit: TypeAlias = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def _corner(photo: LinearPhoto, channel: Channel, edges: tuple[_Line, _Line], half: int) -> _Misfit | None:
-    """How far the pixels around the crossing of two edges differ from a mixture's, over the noise.
-
-    None where they leave the frame. The pixels are drawn with a rim wide enough for its blur.
-    """
+    """How far pixels around a crossing of edges are from a mixture's, over noise; None outside the frame."""
     corner = np.linalg.solve([edge.normal for edge in edges], [edge.place for edge in edges])
     row, col = np.rint(corner).astype(int) - half
     side = 2 * half + 1
@@ -193,13 +189,11 @@ def _corner(photo: LinearPhoto, channel: Channel, edges: tuple[_Line, _Line], ha
 def _drawn(
     corner: NDArray[np.float64], normals: Sequence[NDArray[np.float64]], count: int
 ) -> NDArray[np.complex128]:
-    """Spectra of the half planes beyond two edges, of their product, and of what moves of the edges change.
-
-    No pixel has blurred them: the box in which areas are counted is divided out.
-    """
+    """Spectra of half planes beyond two edges, of their product, and of what moves of the edges change."""
     rows, cols = np.arange(count)[:, None] - corner[0], np.arange(count)[None, :] - corner[1]
     first, second = (edge_area(rows, cols, math.atan2(-n[0], n[1])) for n in normals)
     down, across = fft.fftfreq(count)[:, None], fft.rfftfreq(count)[None, :]
+    # no pixel has blurred them: the box in which areas are counted is divided out
     spectra = fft.rfft2([first, second, first * second]) / (np.sinc(down) * np.sinc(across))
     moves = [2j * np.pi * (n[0] * down + n[1] * across) for n in normals]
     changes = [spectra[0] * moves[0], spectra[1] * moves[1], *(spectra[2] * move for move in moves)]
@@ -214,8 +208,7 @@ def _mixture(
 ) -> NDArray[np.complex128]:
     """Transfer function of three Gaussians at frequencies in cycles/pixel.
 
-    Their parameters are two Cholesky factors, two means (row, col), logarithms of two weights over the
-    third, and of the width of the last, which is round.
+    By two Cholesky factors, two means (row, col), and logarithms of two weights and of the third's width.
     """
     shapes = [*vector[:6].reshape(2, 3), (vector[12], 0.0, vector[12])]
     means = [*vector[6:10].reshape(2, 2), (0.0, 0.0)]

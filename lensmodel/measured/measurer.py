@@ -336,10 +336,7 @@ class Window:
 
     @property
     def variance(self) -> NDArray[np.float64]:
-        """Variance of the noise, its mean for each pixel.
-
-        By its own level a pixel that is dark by chance would count more than others.
-        """
+        """Variance of the noise, its mean: by its own, a pixel dark by chance would count for more."""
         own = self.noise.shot * np.maximum(self.light, 0.0) + self.noise.read
         return np.full(own.shape, float(own[self.measured].mean()) if self.measured.any() else 1.0)
 
@@ -351,11 +348,8 @@ class Window:
 def window_psf(
     window: Window, latent: Latent, size: int, *, varying: bool = False
 ) -> tuple[Solved, tuple[float, float]]:
-    """Measure the PSF of one window; say also how far the latent picture was moved.
-
-    Moved by what a small kernel is off, the latent picture gives a kernel that is nearly centred and needs no
-    interpolation, which would soften a peak as narrow as a pixel.
-    """
+    """Measure the PSF of one window; say also how far the latent picture was moved."""
+    # nearly centred so, the kernel needs no interpolation, which would soften a peak as narrow as a pixel
     _, shift = roughly(window, latent, min(SMALL, size))
     return window.solved(latent(shift, size // 2), size, varying=varying), shift
 

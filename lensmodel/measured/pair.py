@@ -84,11 +84,7 @@ class AperturePair(Measurer):
 
 
 def _scene(closed: LinearPhoto, warp: Warp, window: Window, channel: Channel, size: int) -> Latent:
-    """Sharp picture around a window, on the pixels of the open photo.
-
-    The cosine transform filters as if the picture were mirrored at its rim, which suits a transfer
-    function that is real and even.
-    """
+    """Sharp picture around a window, on the pixels of the open photo."""
     known, index = closed.info.metadata, CHANNELS.index(channel)
     lens = known.aperture or USUAL_F_NUMBER, known.pixel_pitch_um or _USUAL_PITCH_UM
 
@@ -104,6 +100,7 @@ def _scene(closed: LinearPhoto, warp: Warp, window: Window, channel: Channel, si
     down, along = (np.arange(n) / (2.0 * n) for n in region.shape)
     h = diffraction_otf(down[:, None], along, *lens, channel)
     inverse = (1.0 + _DAMPING) * h / (h * h + _DAMPING)  # Wiener's
+    # as if the picture were mirrored at its rim, which suits a transfer function that is real and even
     sharp = fft.idctn(fft.dctn(region, norm="ortho") * inverse, norm="ortho")
     spline = ndimage.spline_filter(sharp, order=5, mode="mirror")
 

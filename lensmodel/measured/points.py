@@ -138,11 +138,9 @@ def _cell_psf(
 
 
 def _stacked(lights: _Lights, kernel: NDArray[np.float64] | None) -> tuple[Solved, float]:
-    """Solve for the kernel of all lights at once; say also what it leaves of them beyond their noise, in L2.
-
-    The kernel of the round before tells the noise of each pixel.
-    """
+    """Solve for the kernel of all lights; say what it leaves of them beyond their noise, as a relative L2."""
     size, good = lights.observed.shape[1], lights.measured
+    # the kernel of the round before tells the noise of each pixel
     even = np.broadcast_to(lights.fluxes[:, None, None] / size**2, lights.observed.shape)
     variance = lights.variance(even if kernel is None else lights.blurred(kernel))
     solved = solve(lights.observed, lights.latent(), good, variance, size)
@@ -191,7 +189,7 @@ def sky_of(plane: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
 def find_lights(plane: NDArray[np.floating]) -> NDArray[np.float64]:
     """Find points of light, brightest first: (n, 3), row, col and the peak above the sky.
 
-    They are the highest of their 5 x 5 neighbours after a little smoothing, at the centroid of 5 x 5 pixels.
+    They are the highest of 5 x 5 pixels after a little smoothing, at the centroid of these.
     """
     sky, scatter = sky_of(plane)
     clean = plane - sky

@@ -59,10 +59,7 @@ _PAGE_SEED: Final = 20120  # any number: printed pages depend on it, so it stays
 
 @dataclass(frozen=True)
 class TargetPage:
-    """A page, by the number of its samples along the long side.
-
-    Coordinates of the page are `(y, x)` in samples; (0, 0) is the middle of its top left sample.
-    """
+    """A page, by its samples along the long side; places are in samples from the first one's middle."""
 
     detail: int  # samples along the long side
 

@@ -70,10 +70,7 @@ class Selector(Protocol):
     """Says how much each window tells about the PSF (Hirsch and Schölkopf, ICCV 2015, section 5.2)."""
 
     def score(self, windows: Windows) -> NDArray[np.float64]:
-        """Score the n windows of a photo, shape (n,), 0..1: higher tells more.
-
-        `windows` tells where they lie, their edges, noise, clipping and spectra.
-        """
+        """Score n windows by edges, noise, clipping and spectra, shape (n,), 0..1: higher tells more."""
 
 
 # --- the selectors -------------------------------------------------------------------------------
@@ -106,11 +103,7 @@ FEATURES: Final = 27  # columns that `features_of` makes
 
 
 def features_of(windows: Windows) -> NDArray[np.float64]:
-    """What a window looks like, in numbers, `(n, FEATURES)`, always finite.
-
-    Directions are sorted by energy, so that a turned window has the same features. Energies and
-    powers are decimal logarithms over noise.
-    """
+    """Numbers of windows, `(n, FEATURES)`, finite: decimal logarithms over noise, the same if turned."""
 
     def log(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.log10(np.maximum(values, 1e-3))
@@ -268,10 +261,7 @@ def _shortlist(windows: Windows) -> list[int]:
 
 
 def _spread(windows: Windows, count: int) -> list[list[int]]:
-    """Choose up to `count` windows, given best first, and group them by field cells.
-
-    First the seeds, one a cell; then the smallest cell takes its best remaining neighbour, up to four.
-    """
+    """Choose up to `count` windows, given best first, by field cells: seeds, then their neighbours."""
     rows, cols, r, phi = (
         part[:, None] - part for part in (windows.rows, windows.cols, windows.r, windows.phi)
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 
@@ -12,8 +12,6 @@ from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, Plane, Planes
 from lensmodel.correction.blur import ONE, ZERO, Real, Sensor, UniformBlur, block_sums, interpolated, smooth
 from lensmodel.correction.richardson_lucy import LEAST_CLIPPED
-
-Window: TypeAlias = tuple[slice, slice]
 
 REBLUR, SPECTRUM, ISOLATED = "re-blur", "spectrum", "isolated pixels"
 
@@ -64,7 +62,7 @@ def held_back(
     blurs: Sequence[UniformBlur] | None,
     sensors: Sequence[Sensor],
     errors: Sequence[float],
-    inner: Window,
+    inner: tuple[slice, slice],
 ) -> tuple[Planes, Plane, Audit]:
     r"""Mix the `inner` part of a tile's correction back towards the photo as far as it fails an audit.
 
@@ -122,13 +120,9 @@ def _point_gains(blurs: Sequence[UniformBlur] | None) -> Real:
     """How much more a point stands out of its surroundings than its image does, by colour."""
     if blurs is None:
         return np.full(len(CHANNELS), _USUAL_GAIN, dtype=np.float32)
-    gains = []
-    for blur in blurs:
-        middle = blur.kernel.shape[0] // 2
-        low = max(middle - 2, 0)
-        mean = float(blur.kernel[low : middle + 3, low : middle + 3].sum() / 25.0)
-        gains.append(np.clip(_ROOM / max(blur.kernel[middle, middle] - mean, 1e-6), 1.0, _USUAL_GAIN))
-    return np.array(gains, dtype=np.float32)
+    kernels, m = [np.pad(blur.kernel, 2) for blur in blurs], [blur.kernel.shape[0] // 2 for blur in blurs]
+    contrast = [k[i + 2, i + 2] - k[i : i + 5, i : i + 5].mean() for k, i in zip(kernels, m, strict=True)]
+    return np.clip(_ROOM / np.maximum(contrast, 1e-6), 1.0, _USUAL_GAIN).astype(np.float32)
 
 
 @jit

@@ -24,6 +24,7 @@ from lensmodel.core.types import Kernel, NoiseModel, Plane, Planes
 Mask = NDArray[np.bool_]
 Real = NDArray[np.float32]
 Complex = NDArray[np.complex64]
+Window = tuple[slice, slice]  # rows and columns
 Number: TypeAlias = Any
 """A number of single precision, which is no `float` to a type checker."""
 

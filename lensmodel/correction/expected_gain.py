@@ -227,8 +227,9 @@ class CellForecast:
 
     @property
     def gain_db(self) -> float:
-        """Expected gain in decibels."""
-        return decibels(self.before, self.after)
+        """Expected gain in decibels; 0 where there is nothing."""
+        there = self.after > 0.0 and self.before > 0.0
+        return 10.0 * math.log10(self.before / self.after) if there else 0.0
 
     def changed(
         self, photo: Planes, solution: Planes, result: Planes, *, mosaic: bool, least: float = WORTH_DB
@@ -355,8 +356,3 @@ def _remaining(
             left[number] += part
             harm[number] += rise
     return left, harm
-
-
-def decibels(before: float, after: float) -> float:
-    """Gain in decibels; 0 where there is nothing."""
-    return 10.0 * math.log10(before / after) if after > 0.0 and before > 0.0 else 0.0

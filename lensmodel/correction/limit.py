@@ -104,16 +104,14 @@ def limited(
         on a line     min( (.24 / e)², 4 ) (h - l)
         at an edge    .06 max( (.1 / e)², 1 ) (H - L), and no more than that
 
-    It is an edge where a quarter of the window lies at the level that is exceeded. What clips, and lamps,
-    which were solved to be twice as bright as saturation, have rules of their own: around them, in the reach
-    of the blur and some more, each colour stays below the photo's most within 1 pixel and above its least
-    within 3, of lamps and white areas within 2; near white areas it gets no brighter. Broad clipped areas
+    It is an edge where a quarter of the window lies at the level that is exceeded. Around what clips, and
+    lamps, solved to be twice as bright as saturation, `_beside_lamps` holds each colour. Broad clipped areas
     stay as they are, white ones in all colours, and what is white all around gets no darker. Colour, the
     shares of red, green and blue in the light, is drawn towards the photo's own at the same place until
     their differences lie, but for .01 (up to .04 where the kernel is known), in the photo's range within 2
     pixels; the light stays. At last each colour, as seen, leaves its own range within 2 pixels by no more
-    than the span of a line, at least by the width of that range and around lamps by no more: where a colour
-    has next to no light, its noise shows.
+    than the span of a line, or by that range if this is more or a lamp is near: where a colour has next to no
+    light, its noise shows.
 
     `halo` is the share of the range that a photographer chose for line and edge.
     """

@@ -25,6 +25,7 @@ from lensmodel.correction.blur import (
     Real,
     Sensor,
     UniformBlur,
+    Window,
     fast_shape,
     smooth,
     through,
@@ -224,8 +225,6 @@ def _advance(start: Real, latent: Real, work: Real, share: Real, alpha: Number) 
             work[i, j] = start[i, j]
         work[i, cols:] = ZERO
 
-
-Window = tuple[slice, slice]
 
 LEAST_CLIPPED: Final = 0.98  # of the clipping level: demosaicing leaves clipped light a little below (chosen)
 _LEAST_SEEN: Final = 0.02

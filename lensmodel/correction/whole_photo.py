@@ -36,16 +36,9 @@ from lensmodel.core.types import (
     zone_of,
 )
 from lensmodel.correction.audit import Audit, held_back
-from lensmodel.correction.blur import Drift, Real, Sensor, Solution, UniformBlur, fitted_halo
+from lensmodel.correction.blur import Drift, Real, Sensor, Solution, UniformBlur, Window, fitted_halo
 from lensmodel.correction.direct_filter import DirectFilter
-from lensmodel.correction.expected_gain import (
-    WORTH_DB,
-    CellForecast,
-    PosteriorField,
-    PsfPosterior,
-    decibels,
-    plan,
-)
+from lensmodel.correction.expected_gain import WORTH_DB, CellForecast, PosteriorField, PsfPosterior, plan
 from lensmodel.correction.limit import Bounds, StoredColour, limited
 from lensmodel.correction.richardson_lucy import SaturationAwareRichardsonLucy
 from lensmodel.correction.sparse_gradient import SparseGradient
@@ -218,8 +211,7 @@ def correct_planes(
     # for blocks smaller than the largest, up to 32 MiB, that it has seen freed.
     np.empty(31 << 20, dtype=np.uint8)
     tell_of_compiling()
-    pitch = usual_pitch(frame, job.cell_factor) if pitch is None else pitch
-    window_cells = [cell for cell in cells(frame, pitch) if cell.meets(window)]
+    window_cells = [cell for cell in cells(frame, pitch, job.cell_factor) if cell.meets(window)]
     if least_gain_db is not None:
         unchanged = _unchanged(job, window_cells, window, workers, _ENOUGH_CELLS)
         if abs(unchanged.expected_gain_db - least_gain_db) < _SURE_DB:
@@ -289,8 +281,8 @@ def zone_reports(forecasts: Sequence[CellForecast], left: Mapping[Zone, int]) ->
     for zone in ZONES:
         if in_zone := [forecast for forecast in forecasts if forecast.zone == zone]:
             error = sum(f.psf_error for f in in_zone) / len(in_zone)
-            gain = decibels(sum(f.before for f in in_zone), sum(f.after for f in in_zone))
-            known = gain if error < _UNKNOWN else None
+            pooled = CellForecast(zone, sum(f.before for f in in_zone), sum(f.after for f in in_zone), error)
+            known = pooled.gain_db if error < _UNKNOWN else None
             reports[zone] = ZoneReport(len(in_zone), known, error, left.get(zone, 0))
     return reports
 
@@ -358,10 +350,6 @@ def tell_of_compiling() -> None:
     event.register("numba:compile", CompilationLog())  # type: ignore[no-untyped-call] # Numba has no types
 
 
-Window = tuple[slice, slice]
-"""Rows and columns of the photo."""
-
-
 def window_of(frame: Frame, roi: tuple[int, int, int, int] | None) -> Window:
     """Rows and columns of a part `(top, left, height, width)` of the frame; None is all of it."""
     top, left, height, width = roi or (0, 0, frame.height, frame.width)
@@ -395,15 +383,14 @@ _MIN_PITCH, _MAX_PITCH = 96, 208
 _RAMP: Final = 16  # pixels over which cells fade into each other (chosen: narrower, a seam may show)
 
 
-def usual_pitch(frame: Frame, factor: int = 1) -> int:
-    """Side of a cell in pixels: a fixed share of the field, times `factor`, within practical bounds."""
-    share = factor * frame.half_diagonal / _CELLS_PER_HALF_DIAGONAL
-    return int(np.clip(share, _MIN_PITCH, factor * _MAX_PITCH))
+def cells(frame: Frame, pitch: int | None = None, factor: int = 1) -> tuple[Cell, ...]:
+    """Cut a frame into cells, row by row; a preview has the same as the whole.
 
-
-def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
-    """Cut a frame into cells of a side of `pitch` pixels, row by row; a preview has the same as the whole."""
-    pitch = usual_pitch(frame) if pitch is None else pitch
+    Their side is `pitch` pixels, or `factor` times a fixed share of the field within practical bounds.
+    """
+    if pitch is None:
+        share = factor * frame.half_diagonal / _CELLS_PER_HALF_DIAGONAL
+        pitch = int(np.clip(share, _MIN_PITCH, factor * _MAX_PITCH))
     down, across = _pieces(frame.height, pitch), _pieces(frame.width, pitch)
     cells = []
     for (rows, rise, row, above, below), (cols, run, col, before, after) in itertools.product(down, across):

@@ -14,8 +14,8 @@ from scipy import ndimage
 from lab.kernels import gaussian
 from lensmodel.core.files import from_json, to_json
 from lensmodel.core.types import NoiseModel, Plane, Planes
-from lensmodel.correction.audit import LIMITS, Audit, Window, held_back
-from lensmodel.correction.blur import Sensor, UniformBlur
+from lensmodel.correction.audit import LIMITS, Audit, held_back
+from lensmodel.correction.blur import Sensor, UniformBlur, Window
 
 SIDE = 160
 WHOLE = (slice(0, SIDE), slice(0, SIDE))

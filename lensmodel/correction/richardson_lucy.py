@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, TypeAlias, get_args
@@ -44,6 +45,8 @@ _TINY: Final = np.float32(1e-6)  # saturations: least light to divide by (chosen
 _LEAST_PREDICTED: Final = np.float32(0.1)  # of the datum: a step raises light tenfold at most (chosen)
 _SOFT: Final = special.softmax(-(np.arange(-10, 11) ** 2) / 18.0).astype(np.float32)
 """Weights that soften the places of lights: a Gaussian of 3 pixels (chosen)."""
+_STEEP: Final = np.exp(-4.0 * np.arange(-3, 4) ** 2).astype(np.float32)
+"""A Gaussian so narrow that all light further than 3 pixels sums up to less than a pixel at that distance."""
 
 _SHARPNESS: Final = 50.0  # a of the sensor response: it bends over a tenth of the clipping level (chosen)
 _OVER: Final = np.linspace(-15.0, 25.0, 4097)  # a (z - t): to a millionth, R is z below and t above
@@ -177,13 +180,12 @@ def _lights(latent: Real, level: Number, reach: int) -> tuple[Mask, Real] | None
     bright = latent >= level
     if not bright.any():
         return None
-    # together a disc of a radius of 3 pixels
-    hard = np.any([ndimage.maximum_filter(bright, size) for size in ((5, 5), (7, 1), (1, 7))], axis=0)
+    hard = (smooth(bright.astype(np.float32), _STEEP) > np.float32(math.exp(-37.0))).astype(np.float32)
     # a square of the operator's reach covers the kernel without knowing its shape
-    near = ndimage.maximum_filter(hard, 2 * reach + 1)
-    soft = smooth(hard.astype(np.float32), _SOFT)
+    near = smooth(hard, np.ones(2 * reach + 1, dtype=np.float32))
     rows, cols = latent.shape
-    return ~near[reach : rows - reach, reach : cols - reach], np.minimum(soft, ONE)
+    clean = near[reach : rows - reach, reach : cols - reach] == ZERO
+    return clean, np.minimum(smooth(hard, _SOFT), ONE)
 
 
 @jit

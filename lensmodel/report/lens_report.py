@@ -194,7 +194,7 @@ class LensReport:
     places: int  # at which these show the blur, in the colour that most of them show
     sensor: SensorGeometry  # for other units than cycles/pixel
     tested: tuple[ApertureReport, ...]  # by aperture, ascending
-    # what else stands on the page: camera, serial, names of photos
+    # what else stands on the page: camera, serial, a caution
     details: Mapping[str, str] = field(default_factory=dict)
 
     def at(self, aperture: float | None) -> ApertureReport:

@@ -31,6 +31,7 @@ from lensmodel.patches import Selector
 from lensmodel.photo import LinearPhoto, PhotoMetadata
 from lensmodel.photo.development import photo_from_array
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
+from lensmodel.photo.metadata import gps_directory
 from lensmodel.photo.values import CORRECTED, remarks_log
 
 log = logging.getLogger(__name__)
@@ -289,6 +290,7 @@ def correct(
     color_space: photo.ColorSpace = "same",
     quality: int = 95,
     least_gain_db: float | None = None,
+    keep_location: bool = False,
     workers: int | None = None,
     on_step: StepHook = ignore_step,
 ) -> correction.Corrected:
@@ -322,6 +324,8 @@ def correct(
         Colors of the written file; `quality` is that of a JPEG, 1..100.
     least_gain_db : float, optional
         Write nothing where a lesser gain is expected (`Corrected.expected_gain_db`); None always writes.
+    keep_location : bool
+        Write where the photo was taken (GPS) into the corrected one too.
     workers : int, optional
         Threads; all cores by default. The result does not depend on it.
     on_step : callable
@@ -391,6 +395,7 @@ def correct(
         color_space=color_space,
         quality=quality,
         description=description,
+        gps=gps_directory(source) if keep_location and source is not None else {},
     )
     return corrected
 

@@ -69,6 +69,9 @@ def correct(
         bool, typer.Option("--force", help="Replace existing files; correct JPEGs whatever they gain.")
     ] = False,
     any_lens: console.AnyLens = False,
+    keep_location: Annotated[
+        bool, typer.Option("--keep-location", help="Keep where the photo was taken (GPS).")
+    ] = False,
     workers: console.Workers = None,
     json_output: console.Json = False,
     quiet: console.Quiet = False,
@@ -125,6 +128,7 @@ def correct(
             "strength": strength,
             "bounds": Bounds(halo, texture, denoise),
             "file_format": file_format,
+            "keep_location": keep_location,
             "workers": workers,
         }
     correction = Correction(targets, given, profile is None, any_lens, force, shown)

@@ -406,6 +406,7 @@ _OF_SRGB: Final = {
     b"gAMA": struct.pack(">I", 45455),
     b"cHRM": struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000),
 }
+_ROUNDED: Final = 500  # of 100,000, by which programs round gamma and places (chosen)
 _HDR: Final = {b"\x10", b"\x12"}  # curves PQ and HLG in cICP, which goes before a profile
 _READ: Final = {b"IDAT", b"eXIf", b"iCCP", b"iTXt", b"sRGB", *_OF_SRGB}
 _PNG_END: Final = struct.pack(">I4sI", 0, b"IEND", zlib.crc32(b"IEND"))
@@ -435,7 +436,7 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     xmp = text[20:].partition(b"\0")[2].partition(b"\0")[2]
     icc = _inflated(found[b"iCCP"].partition(b"\0")[2][1:]) if b"iCCP" in found else None
     known = _OF_SRGB if b"sRGB" not in found else {b"cICP"}  # sRGB goes before gAMA and cHRM
-    other = b", ".join(name for name in known if found.get(name, _OF_SRGB[name]) != _OF_SRGB[name])
+    other = b", ".join(name for name in known if _differs(found.get(name, b""), _OF_SRGB[name]))
     if (other and not icc) or found.get(b"cICP", b"")[1:2] in _HDR:
         said = f"the PNG's {other.decode()} declares colours other than sRGB"
         raise errors.UnsupportedFormatError(f"{said}; convert it to sRGB, or save it with an ICC profile")
@@ -448,6 +449,14 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
         xmp=_inflated(xmp) if text[18:19] == b"\1" else xmp,
         icc=icc,
     )
+
+
+def _differs(said: bytes, of_srgb: bytes) -> bool:
+    """Tell whether a chunk declares other colours, by more than programs round; zeros say nothing."""
+    if len(said) != len(of_srgb) or not any(said):
+        return False
+    a, b = (np.frombuffer(numbers, ">u4").astype(np.int64) for numbers in (said, of_srgb))
+    return bool(np.abs(a - b).max() > _ROUNDED)
 
 
 def png_chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:

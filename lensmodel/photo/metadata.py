@@ -20,13 +20,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
+from pathlib import Path
 from typing import Final
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import escape, quoteattr
 
 from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo import containers
 from lensmodel.photo.containers import ASCII, RATIONAL, Buffer, Header, Tag, Tags, TiffReader, Value, Written
-from lensmodel.photo.values import SOFTWARE, LensIdentity, PhotoMetadata, SerialSource
+from lensmodel.photo.values import SOFTWARE, LensIdentity, Limits, PhotoMetadata, SerialSource
 
 _PLACEHOLDER: Final = re.compile(r"(?i)[0.\-_ x?]*|(.)\1{5,}|none|no lens|n/?a|unknown|null|manual")
 _NO_LENS: Final = re.compile(
@@ -86,6 +87,7 @@ class Said:
         # The tag has 16 bits; above them cameras say 65535 and use the newer ones.
         speeds = _first_within(1.0, 65534.0, number(0x8827)), number(0x8832), number(0x8831), note.iso
         serials = text(0xA431), text(0xC62F), note.body_serial, xmp.get("aux:SerialNumber")
+        stars = _first_within(-1, 5, _quotient(xmp.get("xmp:Rating")), number(0x4746))  # -1 is rejected
         return PhotoMetadata(
             camera_maker=text(0x010F) or xmp.get("tiff:Make"),
             camera_model=text(0x0110) or xmp.get("tiff:Model"),
@@ -101,6 +103,8 @@ class Said:
             pixel_pitch_um=self.placed()[0],
             artist=text(0x013B) or xmp.get("dc:creator"),
             copyright=text(0x8298) or xmp.get("dc:rights"),
+            rating=None if stars is None else int(stars),
+            keywords=tuple(xmp.get("dc:subject", "").splitlines()),
         )
 
     @property
@@ -168,7 +172,9 @@ class Said:
         if pitch is None or header.kind in {"raw", "dng"}:
             return pitch and pitch / zoom, True
         whole = film is not None and abs(pitch / zoom / film - 1.0) < 0.05
-        known = whole or zoom > 1.01 or _is_width_of_sensor(longer * pitch / zoom / 1000.0)
+        uncut = (1.0, 1.5, 4.0 / 3.0) if longer < 1.01 * shorter else (1.0,)  # cameras crop to a square, too
+        widths = (times * longer * pitch / zoom / 1000.0 for times in uncut)
+        known = whole or zoom > 1.01 or any(map(_is_width_of_sensor, widths))
         return pitch / zoom, known and not cut
 
 
@@ -253,11 +259,12 @@ def _olympus(reader: TiffReader, first: int) -> PhotoMetadata:
 
 MAX_XMP_BYTES: Final = 1 << 20  # against files made to cost time; real packets are some kilobytes
 _PROPERTY: Final = re.compile(
-    rb"(?<=[<\s])((?:aux|crs|dc|exif|exifEX|tiff):\w{1,40}+)\s{0,99}+"
+    rb"(?<=[<\s])((?:aux|crs|dc|exif|exifEX|tiff|xmp):\w{1,40}+)\s{0,99}+"
     rb"(?:=\s{0,99}+\"([^\"<]{0,1024}+)\"|=\s{0,99}+'([^'<]{0,1024}+)'"
     rb"|[^<>=]{0,99}+>(?:\s{0,99}+<rdf:[^<>]{0,200}+>){0,3}([^<]{0,1024}+)<)"
 )
 """A property as attribute or element, under the prefix that all programs use: no entities, no recursion."""
+_KEYWORDS: Final = re.compile(rb"<dc:subject>(.{0,16384}?)</dc:subject>", re.DOTALL)
 
 
 def read_xmp(packet: bytes | None) -> Mapping[str, str]:
@@ -267,17 +274,21 @@ def read_xmp(packet: bytes | None) -> Mapping[str, str]:
         for match in _PROPERTY.finditer(packet):
             if value := html.unescape(match[match.lastindex or 0].decode("utf-8", "replace")).strip():
                 properties.setdefault(match[1].decode(), value)
+        if words := _KEYWORDS.search(packet):
+            items = re.findall(r"<rdf:li[^<>]*>([^<]{1,1024})<", words[1].decode("utf-8", "replace"))
+            properties["dc:subject"] = "\n".join(map(html.unescape, items))
     return properties
 
 
 _PACKET: Final = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
 <rdf:Description rdf:about="" xmlns:aux="http://ns.adobe.com/exif/1.0/aux/"
+ xmlns:dc="http://purl.org/dc/elements/1.1/"
  xmlns:xmp="http://ns.adobe.com/xap/1.0/" xmlns:xmpMM="http://ns.adobe.com/xap/1.0/mm/"
  xmlns:stEvt="http://ns.adobe.com/xap/1.0/sType/ResourceEvent#" xmp:CreatorTool={software}{lens}>
 <xmpMM:History><rdf:Seq>
 <rdf:li stEvt:action="filtered" stEvt:softwareAgent={software} stEvt:parameters={done}/>
-</rdf:Seq></xmpMM:History></rdf:Description></rdf:RDF></x:xmpmeta>
+</rdf:Seq></xmpMM:History><dc:subject><rdf:Bag>{keywords}</rdf:Bag></dc:subject></rdf:Description></rdf:RDF></x:xmpmeta>
 <?xpacket end="r"?>"""
 _CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF), " "))
 """What XML has no way to write; cameras put it into names."""
@@ -290,7 +301,9 @@ def xmp_packet(metadata: PhotoMetadata, description: str, lens: str = "") -> byt
         for text in (SOFTWARE, lens or metadata.lens.model, description)
     )
     said = f" aux:Lens={named}" if lens or metadata.lens.model else ""
-    return _PACKET.format(software=software, lens=said, done=done).encode()
+    said += "" if metadata.rating is None else f' xmp:Rating="{metadata.rating}"'
+    words = "".join(f"<rdf:li>{escape(word.translate(_CHARACTERS))}</rdf:li>" for word in metadata.keywords)
+    return _PACKET.format(software=software, lens=said, done=done, keywords=words).encode()
 
 
 # --- as EXIF tags of a written file -------------------------------------------------------------
@@ -376,6 +389,19 @@ def find_location(buffer: Buffer) -> tuple[list[tuple[int, bytes]], bool]:
         spans.append((start, b" " * (end - start)))
     spans = [(at, data) for at, data in spans if bytes(buffer[at : at + len(data)]) != data]
     return _with_checksums(buffer, chunks, spans), len(blocks) <= MAX_BLOCKS and len(words) <= MAX_WORDS
+
+
+def gps_directory(path: Path) -> dict[int, Value]:
+    """Read the GPS directory of a photo, to be written into another file of it; empty without one."""
+    values = dict[int, Value]()
+    with containers.opened_header(path, Limits()) as header:
+        for reader in header.tiff:
+            gps = reader.below(reader.directory(reader.first)[0], containers.GPS)
+            for tag, entry in gps.items():
+                numbers = gps.numbers(tag)  # of texts none
+                if tag < MAX_TAGS and entry.size <= MAX_VALUE and all(map(math.isfinite, numbers)):
+                    values.setdefault(tag, (entry.kind, numbers or gps.raw(tag)))
+    return values
 
 
 def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[tuple[int, bytes]]:

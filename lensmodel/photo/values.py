@@ -80,6 +80,8 @@ class PhotoMetadata:
     pixel_pitch_um: float | None = None  # of the pixels of this file
     artist: str | None = None
     copyright: str | None = None
+    rating: int | None = None  # stars, 0 to 5; -1 rejected
+    keywords: tuple[str, ...] = ()
 
     def settings(self, given: LensSettings | None = None) -> LensSettings:
         """Settings of the lens as the file says; a caller's, meant for a folder, fill what it leaves open."""
@@ -128,9 +130,8 @@ class Encoding:
     icc: bytes | None = None  # the input's profile
     metadata: PhotoMetadata = PhotoMetadata()  # what is written into the output
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # multipliers that make grey grey; green is 1
-    to_srgb: ArrayLike | None = (
-        None  # white-balanced planes to linear sRGB; None: primaries of `icc`, or sRGB
-    )
+    # white-balanced planes to linear sRGB; None: primaries of `icc`, or sRGB
+    to_srgb: ArrayLike | None = None
     xyz_to_camera: ArrayLike | None = None  # CIE XYZ (D65) to camera RGB, for DNG output
     baseline_exposure: float | None = None  # stops by which a DNG asks raw converters to brighten it
     opcodes_2: bytes = b""  # what a DNG asks raw converters to do with a linear image of three colours,

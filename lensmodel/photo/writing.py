@@ -51,13 +51,15 @@ def write_image(
     quality: int = 95,
     description: str = "",
     lens: str = "",
+    gps: Written | None = None,
 ) -> None:
     """Write planes as a file that shows the picture as its input did, complete or not at all.
 
-    It never carries maker notes, serials or the place. Light is clipped to 0..1 but in "tiff32". TIFF, JPEG
-    and DNG keep the sensor orientation and say how to turn it; PNG, where programs ignore that, is written
-    upright. The colour space "same" is profile and curve of the input, and for RAW sRGB with the camera's
-    white balance; "camera-linear", as in DNG, the planes' own numbers.
+    It never carries maker notes or serials, and the place only where its owner wants it (`gps`). Light is
+    clipped to 0..1 but in "tiff32". TIFF, JPEG and DNG keep the sensor orientation and say how to turn it;
+    PNG, where programs ignore that, is written upright. The colour space "same" is profile and curve of the
+    input, and for RAW sRGB with the camera's white balance; "camera-linear", as in DNG, the planes' own
+    numbers.
     """
     if planes.ndim != 3 or planes.shape[0] != 3:
         raise InvalidInputError(f"planes must have the shape (3, height, width), got {planes.shape}")
@@ -71,7 +73,8 @@ def write_image(
     path, metadata = Path(path), encoding.metadata.without_serials()
     if format.startswith("png"):
         metadata = replace(metadata, orientation=1)
-    tags, xmp = written_tags(metadata, description), xmp_packet(metadata, description, lens)
+    tags = {**written_tags(metadata, description), containers.GPS: gps or {}}
+    xmp = xmp_packet(metadata, description, lens)
     if (encoding.opcodes_2 or encoding.opcodes_3) and format != "dng":
         said = "%s: what the DNG leaves to raw converters to correct is not in it; only DNG output keeps that"
         remarks_log.warning(said, path.name)

@@ -187,6 +187,7 @@ CROP = (
 FRAMES = {
     "whole": (jpeg((3000, 2000), pitch=12.0), 12.0, True),
     "crop mode": (jpeg((2000, 1333), pitch=12.0, film=75), 12.0, True),
+    "square": (jpeg((2000, 2000), pitch=12.0), 12.0, True),
     "16 : 9": (jpeg((3000, 1688), pitch=12.0), 12.0, True),
     "scaled down": (jpeg((1200, 800), pitch=12.0), 30.0, True),
     "cut by a program": (jpeg((2250, 1250), pitch=12.0), 12.0, False),

@@ -295,8 +295,10 @@ def test_a_profile_goes_before_what_else_is_declared(tmp_path: Path) -> None:
         chunk(b"cICP", bytes((1, 13, 0, 1))),
         chunk(b"sRGB", b"\0") + gama(1.0),
         gama(0.45455) + chrm(0.3127, 0.3290, 0.64, 0.33, 0.30, 0.60, 0.15, 0.06),
+        gama(0.45),
+        gama(0.0) + chrm(*(0.0,) * 8),
     ],
-    ids=["cICP", "sRGB before gAMA", "as sRGB is approximated"],
+    ids=["cICP", "sRGB before gAMA", "as sRGB is approximated", "rounded", "nonsense"],
 )
 def test_a_png_that_declares_srgb_is_read(chunks: bytes, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_bytes(png_with(chunks))

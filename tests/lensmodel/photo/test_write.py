@@ -24,12 +24,13 @@ import rawpy
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps
+from PIL.TiffImagePlugin import IFDRational
 
 from lab.images import to_srgb
 from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
-from lensmodel.photo.metadata import xmp_packet
+from lensmodel.photo.metadata import gps_directory, xmp_packet
 from lensmodel.photo.writing import XYZ_TO_SRGB, opcodes_of_planes, write_bayer_dng
 
 METADATA = photo.PhotoMetadata(
@@ -336,10 +337,15 @@ def test_the_xmp_packet_says_what_was_done_and_which_lens_it_was(
 
 
 def test_a_packet_of_names_that_xml_cannot_write_is_still_xml() -> None:
-    packet = ET.fromstring(xmp_packet(PLAIN.metadata, "done\x0b", "X\x01T\x1f-3 <&\ufffe>"))
+    strange = replace(PLAIN.metadata, keywords=("X\x01T\x1f-3 <&\ufffe>",))
+
+    packet = ET.fromstring(xmp_packet(strange, "done\x0b", "x\x02"))
 
     described = next(packet.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"))
-    assert described.get("{http://ns.adobe.com/exif/1.0/aux/}Lens") == "X T -3 <& >"
+    assert described.get("{http://ns.adobe.com/exif/1.0/aux/}Lens") == "x "
+    assert [item.text for item in packet.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}li")][1:] == [
+        "X T -3 <& >"
+    ]
 
 
 # --- DNG of a mosaic ----------------------------------------------------------------------------
@@ -424,13 +430,15 @@ def test_files_are_as_private_as_their_writer_asks(tmp_path: Path) -> None:
     assert (tmp_path / "x.dng").stat().st_mode & 0o777 == 0o600
 
 
-# --- what a photo carries beside its pixels: rights, opcodes, place ------------------------------------
+# --- what a photo carries beside its pixels: rights, rating, opcodes, place ---------------------------
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-<rdf:Description xmlns:dc="http://purl.org/dc/elements/1.1/">
+<rdf:Description xmlns:dc="http://purl.org/dc/elements/1.1/" xmlns:xmp="http://ns.adobe.com/xap/1.0/"
+xmp:Rating="{rating}">
 <dc:rights><rdf:Alt><rdf:li xml:lang="x-default">© Ä. Example</rdf:li></rdf:Alt></dc:rights>
-<dc:creator><rdf:Seq><rdf:li>Ä. Example</rdf:li></rdf:Seq></dc:creator>
+<dc:creator><rdf:Seq><rdf:li>Ä. Example</rdf:li><rdf:li>B. Example</rdf:li></rdf:Seq></dc:creator>
+<dc:subject><rdf:Bag><rdf:li>holiday</rdf:li><rdf:li>café &amp; sea</rdf:li></rdf:Bag></dc:subject>
 </rdf:Description></rdf:RDF></x:xmpmeta>"""
 
 
@@ -441,14 +449,38 @@ def corrected(source: Path, target: Path, output: photo.OutputFormat, **options:
     return target
 
 
+@pytest.mark.parametrize("rating", [-1, 0, 4])
 @pytest.mark.parametrize("output", [*FORMATS, "tiff32"])
-def test_copyright_and_artist_of_xmp_are_kept(output: photo.OutputFormat, tmp_path: Path) -> None:
+def test_rights_author_rating_and_keywords_of_xmp_are_kept(
+    output: photo.OutputFormat, rating: int, tmp_path: Path
+) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "x.jpg", xmp=XMP.encode())
+    Image.fromarray(pixels).save(tmp_path / "x.jpg", xmp=XMP.format(rating=rating).encode())
 
     said = photo.inspect(corrected(tmp_path / "x.jpg", tmp_path / "out", output)).metadata
 
-    assert (said.copyright, said.artist) == ("© Ä. Example", "Ä. Example")
+    assert (said.copyright, said.artist, said.rating) == ("© Ä. Example", "Ä. Example", rating)
+    assert said.keywords == ("holiday", "café & sea")
+
+
+@pytest.mark.parametrize("output", [*FORMATS, "tiff32"])
+@pytest.mark.parametrize("order", ["big", "little"])
+def test_the_place_is_kept_where_its_owner_wants_it_and_nowhere_else(
+    output: photo.OutputFormat, order: str, tmp_path: Path
+) -> None:
+    block = Image.Exif()
+    block.endian = ">" if order == "big" else "<"
+    place = (IFDRational(52), IFDRational(30), IFDRational(1234, 100))
+    block.get_ifd(0x8825).update({0: b"\2\3\0\0", 1: "N", 2: place, 3: "E", 4: place, 5: b"\0"})
+    Image.new("RGB", (64, 48), "grey").save(tmp_path / "x.jpg", exif=block)
+
+    kept = corrected(tmp_path / "x.jpg", tmp_path / "kept", output, gps=gps_directory(tmp_path / "x.jpg"))
+    left = corrected(tmp_path / "x.jpg", tmp_path / "left", output)
+
+    found = gps_directory(kept)
+    assert found == gps_directory(tmp_path / "x.jpg")
+    assert found[2] == (5, (52.0, 30.0, 12.34))
+    assert gps_directory(left) == {}
 
 
 def opcode_lists(path: Path) -> list[bytes]:

@@ -23,7 +23,7 @@ from lensmodel.core.psf import PsfSample, delta
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.quality import mtf50_from_kernel
-from lensmodel.report.centring import Centring, SofterSide, direction_in_words
+from lensmodel.report.centring import Asymmetry, Centring, direction_in_words
 from lensmodel.report.export import place_table, to_csv
 from lensmodel.report.lens_report import (
     UNKNOWN,
@@ -243,7 +243,7 @@ def test_all_documents_hold_the_same_figures(soft: LensReport) -> None:
 
 
 def test_the_csv_says_whether_the_lens_is_centred(soft: LensReport) -> None:
-    side = SofterSide(0.2, 0.7, 0.05, significant=True)
+    side = Asymmetry(0.2, 0.7, 0.05, significant=True)
     found = replace(soft.tested[0], centring=Centring("decentred", "", side))
 
     decentred, softer = rows_of(replace(soft, tested=(found,)))[-2:]

@@ -84,16 +84,9 @@ class DirectFilter:
         noise = np.array([s.noise.variance(p).mean() for s, p in zip(sensors, part, strict=True)])
         # of the usual part of the cell, not of its lamps
         usual = np.exp(np.log(np.maximum(ring_power(blurred), 1e-12)).mean(axis=1))
-        laws = np.array(
-            [
-                scene_law(
-                    usual[c],
-                    np.abs(blurs[c].spectrum(GRID)) ** 2,
-                    noise_power(noise[c], c, mosaic=sensors[c].measured is not None),
-                )
-                for c in range(len(blurs))
-            ]
-        )
+        powers = [noise_power(n, c, mosaic=sensors[c].measured is not None) for c, n in enumerate(noise)]
+        passed = [np.abs(blur.spectrum(GRID)) ** 2 for blur in blurs]
+        laws = np.array([scene_law(*each) for each in zip(usual, passed, powers, strict=True)])
         slope = round(2.0 * laws[:, 1].mean()) / 2.0  # few enough to keep their powers
         over = (_CAREFUL * np.maximum(noise, 1e-12) / laws[:, 0]).astype(np.float32)
         amplified = np.empty(len(x), dtype=np.float32)

@@ -95,26 +95,34 @@ def shrink(v: Number, scale: Number, prox: Prox) -> Number:
     return kept if v >= ZERO else -kept
 
 
+# Luma, and two chroma directions, orthonormal.
+_OPPONENT: Final = np.array(
+    [
+        [1 / np.sqrt(3)] * 3,
+        [1 / np.sqrt(2), 0.0, -1 / np.sqrt(2)],
+        [-1 / np.sqrt(6), 2 / np.sqrt(6), -1 / np.sqrt(6)],
+    ],
+    dtype=np.float32,
+)
+
+
 @jit
-def _shrink_row(slopes: Real, scale: Real, factors: Real, rotation: Real, prox: Prox, kept: Real) -> None:
+def _shrink_row(slopes: Real, scale: Real, factors: Real, prox: Prox, kept: Real) -> None:
     """Rotate three gradients to luma and chroma, shrink each, rotate back."""
-    t00, t01, t02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
-    t10, t11, t12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
-    t20, t21, t22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
-    f0, f1, f2 = factors[0], factors[1], factors[2]
-    for j in range(scale.size):
-        r, g, b, s = slopes[0, j], slopes[1, j], slopes[2, j], scale[j]
-        p = shrink(t00 * r + t01 * g + t02 * b, s * f0, prox)
-        q = shrink(t10 * r + t11 * g + t12 * b, s * f1, prox)
-        o = shrink(t20 * r + t21 * g + t22 * b, s * f2, prox)
-        kept[0, j] = t00 * p + t10 * q + t20 * o
-        kept[1, j] = t01 * p + t11 * q + t21 * o
-        kept[2, j] = t02 * p + t12 * q + t22 * o
+    kept[:] = ZERO
+    for k in range(3):
+        red, green, blue = _OPPONENT[k]
+        for j in range(scale.size):
+            along = red * slopes[0, j] + green * slopes[1, j] + blue * slopes[2, j]
+            left = shrink(along, scale[j] * factors[k], prox)
+            kept[0, j] += red * left
+            kept[1, j] += green * left
+            kept[2, j] += blue * left
 
 
 @jit
 def _pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
-    x: Real, scale: Real, factors: Real, rotation: Real, prox: Prox, pull: Real
+    x: Real, scale: Real, factors: Real, prox: Prox, pull: Real
 ) -> None:
     """sum_j F_j^T prox(F_j x) of three planes, periodic forward differences, into `pull`."""
     channels, height, width = x.shape
@@ -126,7 +134,7 @@ def _pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
         for c in range(channels):
             for j in range(width):
                 slopes[c, j] = x[c, below, j] - x[c, i, j]
-        _shrink_row(slopes, scale[i], factors, rotation, prox, kept)
+        _shrink_row(slopes, scale[i], factors, prox, kept)
         for c in range(channels):
             for j in range(width):
                 pull[c, below, j] += kept[c, j]
@@ -135,7 +143,7 @@ def _pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
             for j in range(width - 1):
                 slopes[c, j] = x[c, i, j + 1] - x[c, i, j]
             slopes[c, width - 1] = x[c, i, 0] - x[c, i, width - 1]
-        _shrink_row(slopes, scale[i], factors, rotation, prox, kept)
+        _shrink_row(slopes, scale[i], factors, prox, kept)
         for c in range(channels):
             pull[c, i, 0] += kept[c, width - 1]
             for j in range(width):
@@ -180,7 +188,6 @@ def half_quadratic(  # noqa: C901 - one pass over memory per loop
     scale: Real,
     factors: Real,
     couplings: Real,
-    rotation: Real,
     prox: Prox,
     moved: tuple[Complex, Real, Real],
 ) -> tuple[Real, Real]:
@@ -207,7 +214,7 @@ def half_quadratic(  # noqa: C901 - one pass over memory per loop
         P[:] = X[c]
         to_plane(P, x[c])
     for step in range(steps):
-        _pull_of(x, scale, factors[step], rotation, prox, pull)
+        _pull_of(x, scale, factors[step], prox, pull)
         for c in range(channels):
             if drifts and (step == 0 or step == steps // 2):
                 _drifted(x[c], drift[c], down, across, work, D, E[c])
@@ -240,15 +247,6 @@ def half_quadratic(  # noqa: C901 - one pass over memory per loop
     return x, explained
 
 
-# Luma, and two chroma directions, orthonormal.
-_OPPONENT: Final = np.array(
-    [
-        [1 / np.sqrt(3)] * 3,
-        [1 / np.sqrt(2), 0.0, -1 / np.sqrt(2)],
-        [-1 / np.sqrt(6), 2 / np.sqrt(6), -1 / np.sqrt(6)],
-    ],
-    dtype=np.float32,
-)
 _LIGHT_STEPS: Final = 20  # for the light of clipped pixels, and for that beyond the frame (chosen)
 _TYPICAL_CONTRAST: Final = np.float32(0.02)
 """Variance over squared light at which kappa is `weight`: its unit."""
@@ -345,7 +343,6 @@ class SparseGradient:
             canvas.filled(threshold[None], np.ones(1, dtype=np.float32))[0],
             (weights[None, :] / couplings[:, None]).astype(np.float32) ** power,
             couplings.astype(np.float32),
-            _OPPONENT,
             shrinkage(self.alpha),
             (rates, *_from_middle(canvas, blurs[0])),
         )

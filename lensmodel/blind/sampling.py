@@ -8,11 +8,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import itertools
 import json
 import logging
 import math
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -163,8 +163,8 @@ def require_spread(determined: Sequence[Patch], *, count: int) -> None:
 
 def patches_by_cell(selection: Selection) -> list[tuple[Patch, ...]]:
     """Group accepted patches by field cell, the unit of work, largest groups first."""
-    groups = (tuple(group) for _, group in itertools.groupby(selection.patches, lambda patch: patch.cell))
-    return sorted(groups, key=len, reverse=True)
+    cells = Counter(patch.cell for patch in selection.patches)
+    return [tuple(p for p in selection.patches if p.cell == cell) for cell, _ in cells.most_common()]
 
 
 def estimate_cell(
@@ -301,11 +301,6 @@ def samples_of_photo(
             finally:
                 for job in jobs:
                     job.cancel()  # those not begun, after an error: leaving `with` waits only for what runs
-    if not samples:
-        raise errors.NoUsablePatchesError(
-            f"none of the {total} patches of {path.name} determines a PSF; "
-            "use a photo with more fine detail in focus"
-        )
     green = {sample.position for sample in samples if sample.settings.channel == "g"}
     determined = [patch for group in groups for patch in group if patch.position in green]
     require_spread(determined, count=config.patches)

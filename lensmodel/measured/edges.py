@@ -48,8 +48,7 @@ _CORNER_PX: Final = 64.0  # of a corner from the end of its edges: a side of the
 _REACH_PX: Final = 16.0  # from an edge that its line spread is read at: further out is noise (chosen)
 _TAPER_PX: Final = 4.0  # pixels over which it fades: a sudden end would ring (chosen)
 _LEAST_PX: Final = 0.15  # standard deviation of a Gaussian: narrower looks the same to pixels (chosen)
-# Pixels around a corner that are compared: standard deviations, within limits (chosen)
-_HALF_WIDTHS, _LEAST_HALF, _MOST_HALF = 3.0, 6, 20
+_HALF: Final = 9  # pixels around a corner that are compared: 6 to 20 come to the same (chosen)
 _SPARE_PX: Final = 16  # around them, which the blur of the rim of what is drawn reaches (chosen)
 # Where the fit begins, round: widths of the core and of the wider Gaussian over that of the edges, weights of
 # the latter and of the halo over that of the core, and the halo's width. And a weak prior around it: standard
@@ -157,18 +156,18 @@ def _line(photo: LinearPhoto, channel: Channel, edge: FoundEdge) -> _Line:
 _Misfit: TypeAlias = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-def _corner(photo: LinearPhoto, channel: Channel, edges: tuple[_Line, _Line], half: int) -> _Misfit | None:
+def _corner(photo: LinearPhoto, channel: Channel, edges: tuple[_Line, _Line]) -> _Misfit | None:
     """How far pixels around a crossing of edges are from a mixture's, over noise; None outside the frame."""
     corner = np.linalg.solve([edge.normal for edge in edges], [edge.place for edge in edges])
-    row, col = np.rint(corner).astype(int) - half
-    side = 2 * half + 1
+    row, col = np.rint(corner).astype(int) - _HALF
+    side = 2 * _HALF + 1
     if min(row, col) < 0 or row + side > photo.frame.height or col + side > photo.frame.width:
         return None
     window = Window.of(photo, channel, (int(row), int(col)), side)
     if (good := window.measured).sum() < side:
         return None
     values = window.light[good] / math.sqrt(float(window.variance[0, 0]))
-    slope = np.column_stack([np.ones(values.size), np.argwhere(good) / half - 1.0])  # of the light
+    slope = np.column_stack([np.ones(values.size), np.argwhere(good) / _HALF - 1.0])  # of the light
     count = int(fft.next_fast_len(side + 2 * _SPARE_PX, real=True))
     seen = np.zeros((count, count), dtype=np.bool_)
     seen[_SPARE_PX : _SPARE_PX + side, _SPARE_PX : _SPARE_PX + side] = good
@@ -235,10 +234,8 @@ def _kernel(vector: NDArray[np.float64], size: int) -> Kernel:
 def _square_psf(photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge], size: int) -> Found:
     """Fit the kernel of one square in one colour."""
     lines = [_line(photo, channel, edge) for edge in square]
-    half = math.ceil(_HALF_WIDTHS * math.sqrt(max(line.variance for line in lines)))
-    half = min(max(half, _LEAST_HALF), _MOST_HALF)
     pairs = [(a, b) for a, b in combinations(lines, 2) if abs(a.normal @ b.normal) < math.cos(_CROSSING)]
-    corners = [seen for pair in pairs if (seen := _corner(photo, channel, pair, half)) is not None]
+    corners = [seen for pair in pairs if (seen := _corner(photo, channel, pair)) is not None]
     if not corners:
         raise NotEnoughEvidenceError("no corner of the square is seen")
 

@@ -6,6 +6,7 @@ import dataclasses
 import logging
 import math
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from functools import partial
@@ -21,7 +22,7 @@ from lensmodel.blind.sampling import PRESETS, CalibrationEvent, EventHook, ignor
 from lensmodel.core import errors, processes
 from lensmodel.core.errors import InvalidInputError, OutsideSupportError
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import Channel, FieldPosition, LensSettings, StepHook, ignore_step
+from lensmodel.core.types import Channel, FieldPosition, LensSettings, StepHook
 from lensmodel.lens import Lens
 from lensmodel.model import LensModel, ModelField
 from lensmodel.model.camera_bodies import ALIKE, circle_mm
@@ -66,12 +67,12 @@ def calibrate(
     patches: int | None = None,
     workers: int | None = None,
     executor: Executor | None = None,
-    on_event: EventHook = ignore_event,
+    on_event: EventHook | None = None,
 ) -> Lens:
     """Learn the blur of one lens from photos taken with it (Hirsch and Schölkopf, ICCV 2015).
 
-    Photos that cannot help are passed over, and `on_event` and the log learn why: unreadable, too little
-    detail, no aperture, of another lens. One that the lens knows already is passed over too.
+    Photos that cannot help are passed over, and `on_event` learns why: unreadable, too little detail, no
+    aperture, of another lens. One that the lens knows already is passed over too.
 
     Parameters
     ----------
@@ -101,6 +102,7 @@ def calibrate(
         Runs whole photos instead, on other machines too.
     on_event : callable
         Called as `on_event(event)` with a `CalibrationEvent`; raising `CancelledError` there stops the work.
+        None shows the progress on a terminal or in a notebook.
 
     Raises
     ------
@@ -111,6 +113,7 @@ def calibrate(
         If no photo could be used; the text says why for each.
     """
     _require_workers(workers)
+    on_event = on_event or _show_event
     paths = [Path(photos)] if isinstance(photos, str | Path) else [Path(path) for path in photos]
     for path in paths:
         path.stat()
@@ -130,7 +133,6 @@ def calibrate(
         for event in calibration.learn(paths, executor, on_event=on_event):
             if event.error is not None:
                 reasons.append(f"{event.photo.name}: {event.detail}")
-                log.warning("not used: %s", reasons[-1])
             on_event(event)
     learned = calibration.known
     if learned is None:
@@ -292,7 +294,7 @@ def correct(
     least_gain_db: float | None = None,
     keep_location: bool = False,
     workers: int | None = None,
-    on_step: StepHook = ignore_step,
+    on_step: StepHook | None = None,
 ) -> correction.Corrected:
     """Remove the blur of a lens from a photo: files in and out, or arrays.
 
@@ -329,7 +331,8 @@ def correct(
     workers : int, optional
         Threads; all cores by default. The result does not depend on it.
     on_step : callable
-        Called as `on_step(done, total)`; raising `CancelledError` there stops the work.
+        Called as `on_step(done, total)`; raising `CancelledError` there stops the work. None shows the
+        progress on a terminal.
 
     Returns
     -------
@@ -373,7 +376,7 @@ def correct(
         photo="" if source is None else photo_id(source),
         least_gain_db=least_gain_db,
         workers=workers or os.cpu_count() or 1,
-        on_step=on_step,
+        on_step=on_step or partial(_show_step, "the photo" if source is None else source.name),
     )
     too_little = least_gain_db is not None and corrected.expected_gain_db < least_gain_db
     if target is None or too_little:
@@ -558,3 +561,31 @@ def _format_of(output: Path) -> photo.OutputFormat:
 def _require_workers(workers: int | None) -> None:
     if workers is not None and workers < 1:
         raise InvalidInputError(f"workers must be at least 1, got {workers}; None takes all cores")
+
+
+# --- progress -------------------------------------------------------------------------------------
+
+
+def say(text: str, *, stays: bool = False) -> None:
+    """Show a step on the last line of a terminal; a notebook gets only lines that stay, others nothing."""
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r\x1b[K{text}{chr(10) if stays else ''}")  # in place of the step before
+        sys.stderr.flush()
+    elif stays and "ipykernel" in sys.modules:
+        sys.stderr.write(f"{text}\n")
+
+
+def _show_event(event: CalibrationEvent) -> None:
+    """Show what becomes of a photo."""
+    if event.stage == "counted":
+        say(f"{event.photo.name}: {event.total} samples", stays=True)
+    elif event.stage == "skipped":
+        say(f"{event.photo.name}: not used: {event.detail}", stays=True)
+    else:
+        share = f" {event.done / event.total:.0%}" if event.total else ""
+        say(f"{event.photo.name}: {event.stage}{share}")
+
+
+def _show_step(name: str, done: int, total: int) -> None:
+    """Show how far the correction of a photo is."""
+    say(f"{name}: corrected {done / max(total, 1):.0%}" if done < total else "")

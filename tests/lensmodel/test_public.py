@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 
 import lensmodel
 from lab.kernels import gaussian
+from lensmodel.api import say
 from lensmodel.core import processes
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, centroid
@@ -234,3 +236,29 @@ def test_a_question_outside_what_the_photos_show_warns(r: float, aperture: float
 def test_a_lens_is_shown_in_words(lens: Lens) -> None:
     assert "0x" not in repr(lens)
     assert f"{len(lens.samples)} samples" in repr(lens)
+
+
+@pytest.mark.parametrize(
+    ("terminal", "notebook", "said"),
+    [
+        (True, False, "\r\x1b[Ka.dng: 50%\r\x1b[Ka.dng: done\n"),
+        (False, True, "a.dng: done\n"),
+        (False, False, ""),
+    ],
+)
+def test_a_terminal_shows_each_step_and_a_notebook_whole_lines(
+    terminal: bool,
+    notebook: bool,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
+    if notebook:
+        monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
+
+    say("a.dng: 50%")
+    say("a.dng: done", stays=True)
+
+    assert capsys.readouterr().err == said

@@ -223,7 +223,7 @@ class PatchRecurrence:
         kernel = delta(_LEAST_SIDE) if green is None else green.kernel
         latent = [s.at(levels - 1).y for s in scaled]
         for level in reversed(range(levels)):
-            side = max(_LEAST_SIDE, _odd(size / ALPHA**level))
+            side = max(_LEAST_SIDE, 2 * round((size / ALPHA**level - 1) / 2) + 1)
             views = [s.at(level) for s in scaled]
             kernel = resized(kernel, side) if level == levels - 1 else _upscaled(kernel, side)
             latent = [resized_image(x, v.y.shape) for x, v in zip(latent, views, strict=True)]
@@ -273,10 +273,6 @@ def normal_equations(
     offsets = half - np.arange(side)
     b -= n * noise**2 * response[np.ix_(offsets, offsets)].ravel()
     return a, b
-
-
-def _odd(value: float) -> int:
-    return 2 * round((value - 1) / 2) + 1
 
 
 def _upscaled(kernel: Kernel, side: int) -> Kernel:

@@ -328,18 +328,7 @@ class PhotoGroup:
         Each aperture's first one comes before any second, a photo whose aperture is unknown last in its turn;
         later frames of a burst, which show the same, come after all.
         """
-        repeated, turns = self._repeated(), Counter[tuple[bool, float]]()
-        order = []
-        # a smaller frame is the middle of what the lens draws: the largest ones tell of all of it
-        for shot in sorted(self.shots, key=lambda shot: -round(shot.half_diagonal_mm)):
-            again, aperture = shot.path in repeated, shot.metadata.aperture or math.inf
-            order.append((again, turns[again, aperture], aperture, shot.path))
-            turns[again, aperture] += 1
-        return [path for *_, path in sorted(order)], len(order) - len(repeated)
-
-    def _repeated(self) -> set[Path]:
-        """Later frames of a burst: those that soon follow one at the same settings."""
-        repeated: set[Path] = set()
+        repeated, turns = set[Path](), Counter[tuple[bool, float]]()
         last: dict[tuple[float | None, float], datetime] = {}
         timed = [(shot.metadata.taken_at, shot.path, shot) for shot in self.shots if shot.metadata.taken_at]
         for time, path, shot in sorted(timed, key=lambda each: each[:2]):
@@ -347,7 +336,13 @@ class PhotoGroup:
             if settings in last and time - last[settings] <= BURST:
                 repeated.add(path)
             last[settings] = time
-        return repeated
+        order = []
+        # a smaller frame is the middle of what the lens draws: the largest ones tell of all of it
+        for shot in sorted(self.shots, key=lambda shot: -round(shot.half_diagonal_mm)):
+            again, aperture = shot.path in repeated, shot.metadata.aperture or math.inf
+            order.append((again, turns[again, aperture], aperture, shot.path))
+            turns[again, aperture] += 1
+        return [path for *_, path in sorted(order)], len(order) - len(repeated)
 
 
 def groups(shots: Iterable[Shot]) -> list[PhotoGroup]:

@@ -10,7 +10,8 @@ import numpy as np
 
 from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, Plane, Planes
-from lensmodel.correction.blur import ONE, ZERO, Real, Sensor, UniformBlur, block_sums, interpolated, smooth
+from lensmodel.correction.blur import ONE, ZERO, Real, UniformBlur, block_sums, interpolated, smooth
+from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.richardson_lucy import LEAST_CLIPPED
 
 REBLUR, SPECTRUM, ISOLATED = "re-blur", "spectrum", "isolated pixels"

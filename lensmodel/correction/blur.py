@@ -1,4 +1,4 @@
-"""What a photo is modelled by, blur and sensor, and the periodic canvas on which Fourier methods undo blur.
+"""The blur of a photo, and the periodic canvas on which Fourier methods undo it.
 
 Also what compiled loops share: types, constants, transforms on given buffers, and small filters.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Final, TypeAlias
 
@@ -19,7 +19,7 @@ from scipy import fft
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
 from lensmodel.core.psf import as_kernel, support_radius
-from lensmodel.core.types import Kernel, NoiseModel, Plane, Planes
+from lensmodel.core.types import Kernel, Plane, Planes
 
 Mask = NDArray[np.bool_]
 Real = NDArray[np.float32]
@@ -255,55 +255,6 @@ def transfers(blurs: Sequence[UniformBlur], shape: tuple[int, int], reach: float
         most = np.float32(0.5) * np.abs(spectrum)
         np.multiply(rate, np.minimum(most / np.maximum(change, np.float32(1e-9)), ONE), out=rate)
     return K, rates
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sensor:
-    """What is known of one plane's sensor: its noise and where it clips.
-
-    Parameters
-    ----------
-    noise : NoiseModel
-        Variance against level.
-    clip : float
-        Level at and above which a value is only a lower bound; infinity where nothing clips.
-    measured : ndarray of bool, shape (H, W), or None
-        Where the sensor measured this plane; demosaicing filled in the rest. `None` for everywhere.
-    edges : tuple of bool
-        Which sides of the plane (top, bottom, left, right) are sides of the frame. At the others a rim as
-        wide as the reach of the blur will be cut off: what lies beyond them need not be solved for.
-
-    Raises
-    ------
-    InvalidInputError
-        If `clip` is no positive level.
-    """
-
-    noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
-    clip: float = float("inf")
-    measured: Mask | None = None
-    edges: tuple[bool, bool, bool, bool] = (True, True, True, True)
-
-    def __post_init__(self) -> None:
-        if not self.clip > 0.0:
-            raise InvalidInputError(f"clip must be a positive level, got {self.clip}")
-
-    @property
-    def surrounded(self) -> bool:
-        """Whether no side of the plane is one of the frame."""
-        return not any(self.edges)
-
-    def variance(self, plane: NDArray[np.floating]) -> Real:
-        """Variance of the noise at each pixel of linear light."""
-        return self.noise.variance(plane).astype(np.float32)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Solution:
-    """Planes that were restored together, and the light that a prior took of the data, if there is one."""
-
-    planes: Planes
-    unexplained: Planes | None = None
 
 
 BLOCK: Final = 4  # pixels of a coarse plane's block: coarser than detail, finer than objects (chosen)

@@ -18,8 +18,6 @@ from lensmodel.correction.blur import (
     Canvas,
     Complex,
     Real,
-    Sensor,
-    Solution,
     UniformBlur,
     block_sums,
     interpolated,
@@ -28,7 +26,9 @@ from lensmodel.correction.blur import (
     to_spectrum,
     transfers,
 )
-from lensmodel.correction.expected_gain import GRID, frequency_squared, noise_power, ring_power, scene_law
+from lensmodel.correction.deconvolver import Sensor, Solution
+from lensmodel.correction.expected_gain import frequency_squared, noise_power, ring_power, scene_law
+from lensmodel.correction.posterior import GRID
 from lensmodel.correction.richardson_lucy import Lights, fill_canvas
 
 _TEXTURE: Final = np.float32(0.87)  # t, see `DirectFilter` (chosen as `cell._SHARE` is)

@@ -1,12 +1,6 @@
 """Expected gain of a correction, and its plan: which share of each kernel gains most in a cell.
 
-The power of the scene at each frequency is fitted to a part of the photo. A kernel that is known only roughly
-is not to be undone as if it were exact: with H the true transfer function, random to whoever does not know
-it, the linear filter of least expected error needs its mean and its variance at each frequency::
-
-    G = E[H]* S / ( |E[H]|² S + Var[H] S + n )
-
-Mixing a point into the mean kernel comes close to that with a kernel that any method can use.
+The power of the scene at each frequency is fitted to a part of the photo.
 """
 
 from __future__ import annotations
@@ -16,66 +10,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Final, Protocol, runtime_checkable
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
-from lensmodel.core.psf import delta, otf
-from lensmodel.core.types import Channel, FieldPosition, Kernel, Planes, Zone
-from lensmodel.correction.blur import ONE, ZERO, Complex, Number, Real, Sensor, UniformBlur
-
-GRID: Final = (64, 64)  # pixels: variances are given at its `rfft2` frequencies
-WIDEST: Final = 63  # pixels: side of the largest kernel that the grid holds
-_LEAST: Final = 1e-30  # keeps divisions finite, far below any power
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PsfPosterior:
-    """Mean and uncertainty of a PSF."""
-
-    kernel: Kernel  # (k, k), the mean
-    variance: NDArray[np.float32]  # (64, 33), expected |H - E[H]|² at the `rfft2` frequencies of `GRID`
-    error: float  # expected relative L2 distance of the true kernel from the mean
-    width_error: float  # w, expected relative error of ln |H|, which grows as the squared width
-
-    @classmethod
-    def of_error(cls, kernel: Kernel, error: float, rings: NDArray[np.float64] | None = None) -> PsfPosterior:
-        """A kernel of which the relative L2 error e is known: most likely its width is wrong.
-
-        Var[H] = w² |H|² ln²|H|,  w² = e² sum |H|² / sum |H|² ln²|H|, as an error w of ln |H| makes. It is no
-        more than the square of the error that is expected at a frequency, where its r.m.s. in eight `rings`
-        up to .5 cycles/pixel is known; below the middle of the first it falls as |f|².
-        """
-        if not (math.isfinite(error) and error >= 0.0):
-            raise InvalidInputError(f"psf_error must be finite and not negative, got {error}")
-        if error == 0.0 or kernel.shape[0] > WIDEST:
-            return cls(kernel, np.zeros((GRID[0], GRID[1] // 2 + 1), dtype=np.float32), error, 0.0)
-        H = otf(kernel, GRID)
-        power = np.maximum(H.real**2 + H.imag**2, _LEAST)
-        shape = power * (0.5 * np.log(power)) ** 2
-        times = np.full(power.shape, 2.0)  # how often each column of the half spectrum stands in the whole
-        times[:, [0, -1]] = 1.0
-        scale = error**2 * float((times * power).sum()) / max(float((times * shape).sum()), _LEAST)
-        variance = scale * shape
-        if rings is not None:
-            f = np.hypot(fft.fftfreq(GRID[0])[:, None], fft.rfftfreq(GRID[1]))
-            middles = (np.arange(len(rings)) + 0.5) / (2 * len(rings))
-            known = np.interp(f, middles, rings) * np.minimum(f / middles[0], 1.0) ** 2
-            variance = np.minimum(variance, known**2)
-        return cls(kernel, variance.astype(np.float32), error, math.sqrt(scale))
-
-
-@runtime_checkable
-class PosteriorField(Protocol):
-    """A posterior of the PSF for every place and channel."""
-
-    def posterior_at(self, position: FieldPosition, channel: Channel) -> PsfPosterior:
-        """Return what is known of the PSF at a field position, its kernel cut to its support."""
-
+from lensmodel.core.psf import delta
+from lensmodel.core.types import Planes, Zone
+from lensmodel.correction.blur import ONE, ZERO, Complex, Number, Real, UniformBlur
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.posterior import GRID, WIDEST, PsfPosterior
 
 SLOPE = 2.2
 """Exponent of the power spectrum of natural images, S(f) = c |f|^-2.2: A. Torralba, A. Oliva, "Statistics of
@@ -212,6 +158,7 @@ _SHARES: Final = np.array([1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1, 0
 
 _SHARPER: Final = 3.0  # sigmas of width tried out of focus (chosen: with 2, twice as many such blocks lose)
 
+_LEAST: Final = 1e-30  # keeps divisions finite, far below any power
 _EVERY: Final = 3  # of the rows and columns suffices for a mean; odd, to meet all colours of a mosaic
 _MOST: Final = 0.7  # of a mosaic's error that a change is credited with (chosen: none takes all of it away)
 

@@ -17,7 +17,8 @@ from scipy import ndimage
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, Planes
-from lensmodel.correction.blur import ONE, ZERO, Mask, Number, Real, Sensor, UniformBlur
+from lensmodel.correction.blur import ONE, ZERO, Mask, Number, Real, UniformBlur
+from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.richardson_lucy import LEAST_CLIPPED, compact
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.colour import curves_of, encode, inverse

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.types import Planes
-from lensmodel.correction.blur import ONE, ZERO, Canvas, Mask, Real, Sensor, smooth
+from lensmodel.correction.blur import ONE, ZERO, Canvas, Mask, Real, smooth
+from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.expected_gain import wiener_spectrum
 
 _WINDOW: Final = 2.0

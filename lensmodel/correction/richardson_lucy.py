@@ -24,13 +24,13 @@ from lensmodel.correction.blur import (
     Mask,
     Number,
     Real,
-    Sensor,
     UniformBlur,
     Window,
     fast_shape,
     smooth,
     through,
 )
+from lensmodel.correction.deconvolver import Sensor
 
 Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 """How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""

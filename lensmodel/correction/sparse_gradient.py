@@ -26,8 +26,6 @@ from lensmodel.correction.blur import (
     Complex,
     Number,
     Real,
-    Sensor,
-    Solution,
     UniformBlur,
     block_sums,
     interpolated,
@@ -35,6 +33,7 @@ from lensmodel.correction.blur import (
     to_spectrum,
     transfers,
 )
+from lensmodel.correction.deconvolver import Sensor, Solution
 from lensmodel.correction.expected_gain import prior, wiener_spectrum
 from lensmodel.correction.mosaic import refill, spread_grain
 from lensmodel.correction.richardson_lucy import Lights, fill_canvas

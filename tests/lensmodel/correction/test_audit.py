@@ -15,7 +15,8 @@ from lab.kernels import gaussian
 from lensmodel.core.files import from_json, to_json
 from lensmodel.core.types import NoiseModel, Plane, Planes
 from lensmodel.correction.audit import LIMITS, Audit, held_back
-from lensmodel.correction.blur import Sensor, UniformBlur, Window
+from lensmodel.correction.blur import UniformBlur, Window
+from lensmodel.correction.deconvolver import Sensor
 
 SIDE = 160
 WHOLE = (slice(0, SIDE), slice(0, SIDE))

@@ -13,7 +13,8 @@ from lab.kernels import gaussian
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Frame, Kernel, NoiseModel
 from lensmodel.correction import correct_planes
-from lensmodel.correction.blur import Sensor, UniformBlur
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.richardson_lucy import Lights, compact, regions
 
 REACH = 4

@@ -10,7 +10,8 @@ from scipy import ndimage
 
 from lab.kernels import gaussian
 from lensmodel.core.types import NoiseModel, Planes
-from lensmodel.correction.blur import Sensor, UniformBlur
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.limit import extremes, limited, widening
 
 BLUR = UniformBlur(gaussian(15, np.eye(2) * 1.5**2))

@@ -10,7 +10,7 @@ import pytest
 from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import otf
-from lensmodel.correction.expected_gain import GRID, PsfPosterior
+from lensmodel.correction.posterior import GRID, PsfPosterior
 
 SIDE = 31
 WIDE = gaussian(SIDE, 2.0**2 * np.eye(2))

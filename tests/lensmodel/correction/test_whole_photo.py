@@ -23,9 +23,10 @@ from lensmodel.core.types import (
     Planes,
 )
 from lensmodel.correction import Bounds, Corrected, correct_planes, whole_photo
-from lensmodel.correction.blur import Sensor, Solution
-from lensmodel.correction.expected_gain import PsfPosterior, plan
-from lensmodel.correction.whole_photo import cells
+from lensmodel.correction.cell import cells
+from lensmodel.correction.deconvolver import Sensor, Solution
+from lensmodel.correction.expected_gain import plan
+from lensmodel.correction.posterior import PsfPosterior
 
 FRAME = Frame(152, 208)  # two cells by two
 LARGE = Frame(200, 260)  # two by three
@@ -476,7 +477,7 @@ def test_a_cell_of_which_next_to_nothing_is_left_to_correct_stays_as_it_was(
         del method, rest
         return Solution(tile + np.float32(1e-4) * rng.standard_normal(tile.shape, dtype=np.float32))
 
-    monkeypatch.setattr("lensmodel.correction.whole_photo.restore_planes", hardly)
+    monkeypatch.setattr("lensmodel.correction.cell.restore_planes", hardly)
 
     made = correct_planes(seen, Soft(), FRAME, noise=BASE, bounds=Bounds(texture=0.0))
 

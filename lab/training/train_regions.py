@@ -27,7 +27,8 @@ from lab.cases import list_photos, photo_half, scene_of
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, ignore_step
-from lensmodel.patches.select import FEATURES, RMapSelector, features_of, first_reasons
+from lensmodel.patches.good_regions import FEATURES, features_of
+from lensmodel.patches.select import RMapSelector, first_reasons
 from lensmodel.patches.windows import BLOCKS_A_SIDE, details_of, windows_of
 from lensmodel.simulate import draw_lens
 

@@ -9,7 +9,7 @@ import pytest
 
 from lab.training.train_regions import Labelled, fit
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.patches.select import FEATURES
+from lensmodel.patches.good_regions import FEATURES
 
 
 def labelled(count: int, half: str, seed: int) -> list[Labelled]:

@@ -6,7 +6,8 @@ from scipy import ndimage
 
 from lensmodel.core.types import NoiseModel, Plane, ignore_step
 from lensmodel.patches import Selector
-from lensmodel.patches.select import FEATURES, GoodRegionsSelector, RMapSelector, features_of
+from lensmodel.patches.good_regions import FEATURES, GoodRegionsSelector, features_of
+from lensmodel.patches.select import RMapSelector
 from lensmodel.patches.windows import Windows, details_of, windows_of
 
 SIGMA = 0.004

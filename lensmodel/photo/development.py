@@ -378,20 +378,22 @@ def _colour(
 
 def _develop_raster(path: Path, said: Said, info: values.PhotoInfo) -> values.LinearPhoto:
     """Decode a picture and turn its numbers into linear light by its transfer curve."""
-    header, pixels = said.header, _read_pixels(path, said.header)
+    header, (pixels, transparent) = said.header, _read_pixels(path, said.header)
     height, width = pixels.shape[:2]
     if (height, width) != (info.height, info.width):
         said_so = f"the header says {info.width} x {info.height}, the decoder gave {width} x {height}"
         raise errors.UnreadablePhotoError(f"{said_so}; save it anew")
     floating, depth, remarks = pixels.dtype.kind == "f", pixels.dtype.itemsize, list[str]()
     transfer, icc = _transfer_of(said, floating, remarks)
+    if transparent:
+        remarks.append("its transparency is dropped")
     if info.turned:
         said_so = "a program has turned its pixels upright, and nothing tells which way"
         remarks.append(f"{said_so}: the more the PSFs of both differ, the less is corrected")
     curves = colour.curves_of(transfer, icc)
     planes: Planes = np.empty((3, height, width), dtype=np.float32)
     for k, curve in enumerate(curves):
-        planes[k] = colour.decode(pixels[:, :, k], curve)
+        planes[k] = pixels[:, :, k] if transfer == "linear" else colour.decode(pixels[:, :, k], curve)
     green, code = curves[1], colour.CODES // 255 if depth == 1 else 1
     clip = (max(1.0, float(planes.max())) if floating else 1.0,) * 3
     codes, step = green[::code] if depth == 1 else None, float(green[code] - green[0])
@@ -422,8 +424,8 @@ def _transfer_of(said: Said, floating: bool, remarks: list[str]) -> tuple[values
     return "linear" if floating else "icc" if declared else "srgb", declared
 
 
-def _read_pixels(path: Path, header: containers.Header) -> Pixels:
-    """Decode to numbers `(row, col, 3)`; transparency is dropped."""
+def _read_pixels(path: Path, header: containers.Header) -> tuple[Pixels, bool]:
+    """Decode to numbers `(row, col, 3)`, and say whether transparency that differs was dropped."""
     name = header.kind.upper()
     try:
         if header.kind == "tiff":
@@ -438,7 +440,8 @@ def _read_pixels(path: Path, header: containers.Header) -> Pixels:
         else:
             with containers.opened_jpeg(containers.JpegSegments(path.read_bytes())) as image:
                 pixels = np.asarray(image.convert("RGB"))
-        return _three_channels(pixels)
+        transparent = pixels.shape[2:] in {(2,), (4,)} and bool(np.ptp(pixels[..., -1]) > 0)
+        return _three_channels(pixels), transparent
     except (MemoryError, errors.LensModelError):
         raise
     except Exception as error:  # decoders meet hostile files with exceptions of any kind

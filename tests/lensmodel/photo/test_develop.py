@@ -206,7 +206,7 @@ def test_srgb_is_decoded_in_full_precision_grey_to_three_planes_and_alpha_droppe
     agree(developed.planes, np.broadcast_to(truth, (3, 40, 60)), atol=1e-6)
     assert developed.encoding.bit_depth == 8 * np.dtype(dtype).itemsize
     assert developed.clip == (1.0, 1.0, 1.0)
-    assert developed.remarks == ()
+    assert developed.remarks == (("its transparency is dropped",) if channels == 4 else ())
 
 
 @pytest.mark.parametrize("compression", [None, "lzw", "zlib"])
@@ -226,7 +226,7 @@ def test_float_tiffs_are_linear_light(tmp_path: Path) -> None:
     pixels[1, 1] = 3.0
     developed = photo.develop(save(tmp_path, "tiff", pixels, photometric="rgb"))
 
-    agree(developed.planes[:, 2:], np.moveaxis(pixels, -1, 0)[:, 2:], rtol=1e-6)
+    agree(developed.planes[:, 2:], np.moveaxis(pixels, -1, 0)[:, 2:])
     assert np.isfinite(developed.planes).all()
     assert developed.clip == (3.0, 3.0, 3.0)
 

@@ -337,15 +337,16 @@ _MAX_READS: Final = 1 << 17  # of a header: four of each segment and one of each
 
 
 class JpegSegments(io.BytesIO):
-    """Bytes of a JPEG for Pillow; Exif in its header is kept here, and blank there.
+    """Bytes of a JPEG for Pillow; Exif and profile in its header are kept here, and blank there.
 
-    Pillow joins blocks of Exif in quadratic time, and reads all values of their directories into memory
-    however often they overlap.
+    Pillow joins blocks of Exif in quadratic time, reads all values of their directories into memory however
+    often they overlap, drops an ICC profile whose parts are miscounted, and fails at a part without a number.
     """
 
     def __init__(self, data: bytes) -> None:
         super().__init__(data)
-        self.exif, self.reads, self.in_header = list[bytes](), 0, True
+        self.exif, self.parts = list[bytes](), list[bytes]()
+        self.reads, self.in_header = 0, True
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read on, as a file does."""
@@ -354,10 +355,11 @@ class JpegSegments(io.BytesIO):
         if self.reads > _MAX_READS:
             said = f"the JPEG's header does not end within {_MAX_READS // 4} segments"
             raise errors.NotAnImageError(f"{said}; {_SAVE_ANEW}")
-        if not (self.in_header and data.startswith(b"Exif\0")):
-            return data
-        self.exif.append(data)
-        return bytes(len(data))
+        for word, kept in ((b"Exif\0", self.exif), (b"ICC_PROFILE\0", self.parts)):
+            if self.in_header and data.startswith(word):
+                kept.append(data)
+                return bytes(len(data))
+        return data
 
 
 def opened_jpeg(segments: JpegSegments) -> JpegImageFile:
@@ -377,9 +379,8 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
             said = f"the JPEG has no frame header, or none of 8 bits ({error})"
             raise errors.NotAnImageError(f"{said}; {_SAVE_ANEW}") from error
         raise errors.TruncatedImageError(f"the JPEG ends inside its header; {COPY_AGAIN}") from error
-    # Pillow drops a profile whose parts say to be more, or fewer; the byte behind the word is their number
-    parts = dict.fromkeys(data for _, data in image.applist if data.startswith(b"ICC_PROFILE\0"))
-    profile = b"".join(part[14:] for part in sorted(parts, key=lambda part: part[12:13]))
+    # the byte behind the word is the number of a part
+    parts = sorted(dict.fromkeys(segments.parts), key=lambda part: part[12:13])
     luma, chroma = (2 * (image.layer or [(0, 1, 1, 0)]))[:2]  # grey is its own chroma
     step = luma[2] // max(chroma[2], 1), luma[1] // max(chroma[1], 1)
     whole = buffer.find(_END_OF_IMAGE, segments.tell()) >= 0  # in a scan a zero follows each byte of 0xFF
@@ -389,7 +390,7 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
         channels=image.layers,
         tiff=tuple(TiffReader.open(block, 6) for block in segments.exif),
         xmp=image.info.get("xmp"),
-        icc=profile if parts else None,
+        icc=b"".join(part[14:] for part in parts) if parts else None,
         # cameras give the first table to luma
         coarseness=float(statistics.median(image.quantization.get(0, [0]))),
         chroma_step=step if {*step} <= {1, 2, 4} else (1, 1),
@@ -436,7 +437,7 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     xmp = text[20:].partition(b"\0")[2].partition(b"\0")[2]
     icc = _inflated(found[b"iCCP"].partition(b"\0")[2][1:]) if b"iCCP" in found else None
     known = _OF_SRGB if b"sRGB" not in found else {b"cICP"}  # sRGB goes before gAMA and cHRM
-    other = b", ".join(name for name in known if _differs(found.get(name, b""), _OF_SRGB[name]))
+    other = b", ".join(name for name in known if _differs(name, found.get(name, b"")))
     if (other and not icc) or found.get(b"cICP", b"")[1:2] in _HDR:
         said = f"the PNG's {other.decode()} declares colours other than sRGB"
         raise errors.UnsupportedFormatError(f"{said}; convert it to sRGB, or save it with an ICC profile")
@@ -451,12 +452,12 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     )
 
 
-def _differs(said: bytes, of_srgb: bytes) -> bool:
+def _differs(name: bytes, said: bytes) -> bool:
     """Tell whether a chunk declares other colours, by more than programs round; zeros say nothing."""
-    if len(said) != len(of_srgb) or not any(said):
+    if len(said) != len(_OF_SRGB[name]) or not any(said):
         return False
-    a, b = (np.frombuffer(numbers, ">u4").astype(np.int64) for numbers in (said, of_srgb))
-    return bool(np.abs(a - b).max() > _ROUNDED)
+    a, b = (np.frombuffer(numbers, ">u4").astype(np.int64) for numbers in (said, _OF_SRGB[name]))
+    return bool(np.abs(a - b).max() > (_ROUNDED if name != b"cICP" else 0))
 
 
 def png_chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
@@ -537,7 +538,8 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
         # LibRaw would take an array that no demosaicing here is made for, for another
         if 33422 in photo and len(shape := photo.integers(33421, 2)) == 2:
             letters = "".join(_FILTERS[n : n + 1] or "?" for n in photo.raw(33422)[:256])
-            require_known_mosaic([letters[k * shape[1] : (k + 1) * shape[1]] for k in range(shape[0])])
+            rows = range(min(shape[0], 256))
+            require_known_mosaic([letters[k * shape[1] : (k + 1) * shape[1]] for k in rows])
         if header.compression == LOSSY_DNG and starts and lengths:
             tile = buffer[starts[0] : starts[0] + min(lengths[0], MAX_BLOCK_BYTES)]  # the first for all
             with contextlib.suppress(errors.NotAnImageError, errors.TruncatedImageError):

@@ -264,7 +264,7 @@ _PROPERTY: Final = re.compile(
     rb"|[^<>=]{0,99}+>(?:\s{0,99}+<rdf:[^<>]{0,200}+>){0,3}([^<]{0,1024}+)<)"
 )
 """A property as attribute or element, under the prefix that all programs use: no entities, no recursion."""
-_KEYWORDS: Final = re.compile(rb"<dc:subject>(.{0,16384}?)</dc:subject>", re.DOTALL)
+MAX_KEYWORDS: Final = 1 << 14  # bytes of their list (chosen)
 
 
 def read_xmp(packet: bytes | None) -> Mapping[str, str]:
@@ -274,8 +274,8 @@ def read_xmp(packet: bytes | None) -> Mapping[str, str]:
         for match in _PROPERTY.finditer(packet):
             if value := html.unescape(match[match.lastindex or 0].decode("utf-8", "replace")).strip():
                 properties.setdefault(match[1].decode(), value)
-        if words := _KEYWORDS.search(packet):
-            items = re.findall(r"<rdf:li[^<>]*>([^<]{1,1024})<", words[1].decode("utf-8", "replace"))
+        words = packet.partition(b"<dc:subject>")[2].partition(b"</dc:subject>")[0][:MAX_KEYWORDS]
+        if items := re.findall(r"<rdf:li[^<>]*>([^<]{1,1024})<", words.decode("utf-8", "replace")):
             properties["dc:subject"] = "\n".join(map(html.unescape, items))
     return properties
 
@@ -351,6 +351,7 @@ def written_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Va
 # Bounds against files made to cost time (chosen): Exif blocks, of which a photo has one and each preview;
 # tags of GPS, of which there are 32; bytes of a value, of which honest ones have some dozen; words of XMP.
 MAX_BLOCKS, MAX_TAGS, MAX_VALUE, MAX_WORDS = 64, 64, 1 << 16, 1000
+MAX_KEPT: Final = 512  # bytes of a value that is kept: all together must fit into the 64 KiB of a JPEG
 
 _BLOCKS: Final = re.compile(rb"Exif\0\0|CMT4")  # before a TIFF structure; the latter in CR3, of GPS alone
 _VALUE: Final = rb'(?:\s*=\s*(?:"([^"<>]{0,200})"|\'([^\'<>]{0,200})\')|\s*>([^<>]{0,200})<)'
@@ -372,7 +373,7 @@ def find_location(buffer: Buffer) -> tuple[list[tuple[int, bytes]], bool]:
     spans, chunks = list[tuple[int, bytes]](), list[tuple[bytes, int, int]]()
     if buffer[:4] == b"\x89PNG":
         with contextlib.suppress(TruncatedImageError):
-            chunks.extend(containers.png_chunks(buffer))
+            chunks.extend(chunk for chunk in containers.png_chunks(buffer) if chunk[0] != b"IDAT")
     blocks = list(islice(_BLOCKS.finditer(buffer), MAX_BLOCKS + 1))
     places = [(0, False), *((start, False) for name, start, _ in chunks if name == b"eXIf")]
     places += [(block.end(), block[0] == b"CMT4") for block in blocks[:MAX_BLOCKS]]
@@ -398,8 +399,10 @@ def gps_directory(path: Path) -> dict[int, Value]:
         for reader in header.tiff:
             gps = reader.below(reader.directory(reader.first)[0], containers.GPS)
             for tag, entry in gps.items():
+                if tag >= MAX_TAGS or entry.size > MAX_KEPT:
+                    continue
                 numbers = gps.numbers(tag)  # of texts none
-                if tag < MAX_TAGS and entry.size <= MAX_VALUE and all(map(math.isfinite, numbers)):
+                if all(abs(number) < 2**31 for number in numbers):  # and not NaN
                     values.setdefault(tag, (entry.kind, numbers or gps.raw(tag)))
     return values
 
@@ -425,7 +428,7 @@ def _with_checksums(
     """Renew the checksums of a PNG's chunks that change; hide those whose metadata cannot be searched."""
     renewed = list(spans)
     for name, start, length in chunks:
-        if name == b"IDAT" or length > 2 * containers.MAX_BLOCK_BYTES:
+        if length > 2 * containers.MAX_BLOCK_BYTES:
             continue
         chunk = bytearray(buffer[start - 4 : start + length])
         inside = [(at - start + 4, data) for at, data in spans if start <= at < start + length]

@@ -30,7 +30,7 @@ from lensmodel.core.errors import (
     UnsupportedFormatError,
 )
 from lensmodel.photo.colour import named_profile, read_profile
-from lensmodel.photo.containers import BYTE, LONG, SHORT, Tag, Tags, laid_out
+from lensmodel.photo.containers import BYTE, LONG, Tag, Tags, laid_out
 from lensmodel.photo.sensor import require_known_mosaic
 from lensmodel.photo.writing import write_bayer_dng
 
@@ -137,16 +137,23 @@ def test_a_tiff_of_a_volume_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("rows", "columns", "colours"),
-    [(2, 2, "RGRG"), (2, 4, "RGGBGRBG"), (2, 2, "CYGM"), (2, 2, "RWGB"), (8, 2, "RGGBRGGBRGGBRGGB")],
+    [
+        (2, 2, "RGRG"),
+        (2, 4, "RGGBGRBG"),
+        (2, 2, "CYGM"),
+        (2, 2, "RWGB"),
+        (8, 2, "RGGBRGGBRGGBRGGB"),
+        (1 << 31, 0, "RG"),
+    ],
 )
 def test_every_mosaic_that_is_not_demosaiced_here_is_refused(
     rows: int, columns: int, colours: str, tmp_path: Path
 ) -> None:
     pattern = bytes("RGBCMYW".index(letter) for letter in colours)
-    tags = {256: (LONG, 64), 257: (LONG, 48), 33421: (SHORT, (rows, columns)), 33422: (BYTE, pattern)}
+    tags = {256: (LONG, 64), 257: (LONG, 48), 33421: (LONG, (rows, columns)), 33422: (BYTE, pattern)}
     (tmp_path / "x.dng").write_bytes(laid_out({**tags, 50706: (BYTE, b"\1\4\0\0")}))
 
-    with pytest.raises(UnsupportedFormatError, match=f"{rows} x {columns} pixels"):
+    with pytest.raises(UnsupportedFormatError, match=f"{min(rows, 256)} x {columns} pixels"):
         photo.inspect(tmp_path / "x.dng")
 
 
@@ -316,6 +323,7 @@ def test_a_png_that_declares_srgb_is_read(chunks: bytes, tmp_path: Path) -> None
         (png_with(chrm(0.3127, 0.3290, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)), "cHRM"),
         (png_with(chunk(b"sRGB", b"\0"), chunk(b"cICP", bytes((9, 16, 0, 1)))), "cICP"),
         (png_with(chunk(b"cICP", bytes((9, 18, 0, 1))), PROFILE), "cICP"),
+        (png_with(chunk(b"cICP", bytes((1, 13, 0, 0)))), "cICP"),  # limited range
     ],
 )
 def test_colours_that_only_chunks_declare_are_refused_before_the_file_is_stored(
@@ -358,6 +366,7 @@ UNUSABLE = {
     "x.jpg, a part is missing": jpeg_with(
         parts_of(ADOBE_RGB, [(1, 3), (2, 3), (3, 3)])[: -len(ADOBE_RGB) // 3 - 18]
     ),
+    "x.jpg, without a number": jpeg_with(segments_of(0xE2, b"ICC_PROFILE\0")),
     "x.jpg, nonsense": jpeg_with(parts_of(bytes(200), [(1, 1)])),
     "x.jpg, CMYK": jpeg_with(parts_of(ADOBE_RGB[:16] + b"CMYK" + ADOBE_RGB[20:], [(1, 1)])),
     "x.png, not packed": png_with(chunk(b"iCCP", b"x\0\0" + ADOBE_RGB)),

@@ -6,6 +6,8 @@ import csv
 import io
 import math
 import struct
+import time
+import tracemalloc
 import zlib
 from collections.abc import Callable
 from datetime import datetime
@@ -199,6 +201,13 @@ def test_a_damaged_xmp_packet_gives_what_came_before() -> None:
 
     assert read_xmp(packet[:-20])["aux:LensSerialNumber"] == "77"
     assert read_xmp(b"\xff\xfe nonsense") == {}
+
+
+def test_keywords_that_never_end_cost_no_time() -> None:
+    started = time.process_time()
+
+    assert read_xmp(80_000 * b"<dc:subject>\n") == {}
+    assert time.process_time() - started < 2.0
 
 
 @pytest.mark.parametrize(
@@ -398,6 +407,19 @@ def test_the_place_in_a_part_of_a_raw_file_goes_too(head: bytes, part: bytes) ->
 @pytest.mark.parametrize("kind", FILES)
 def test_photos_that_say_nothing_are_not_touched(kind: str) -> None:
     assert find_location(saved(kind)) == ([], True)
+
+
+def test_a_png_of_countless_empty_parts_costs_no_memory() -> None:
+    data, part = FILES["png"], struct.pack(">I4sI", 0, b"IDAT", zlib.crc32(b"IDAT"))
+    at = data.index(b"IDAT") - 4
+
+    tracemalloc.start()
+    after = cleaned(data[:at] + 30_000 * part + data[at:])
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert not any(secret in after for secret in SECRET)
+    assert most < 4 * len(after)
 
 
 def test_a_file_of_nothing_but_exif_blocks_is_said_to_be_more_than_was_looked_at() -> None:

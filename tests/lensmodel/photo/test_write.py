@@ -30,6 +30,7 @@ from lab.images import to_srgb
 from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
+from lensmodel.photo.containers import ASCII, GPS, RATIONAL, SRATIONAL, UNDEFINED, laid_out
 from lensmodel.photo.metadata import gps_directory, xmp_packet
 from lensmodel.photo.writing import XYZ_TO_SRGB, opcodes_of_planes, write_bayer_dng
 
@@ -481,6 +482,25 @@ def test_the_place_is_kept_where_its_owner_wants_it_and_nowhere_else(
     assert found == gps_directory(tmp_path / "x.jpg")
     assert found[2] == (5, (52.0, 30.0, 12.34))
     assert gps_directory(left) == {}
+
+
+def test_of_a_place_what_cannot_be_written_is_left_out(tmp_path: Path) -> None:
+    hostile = {
+        1: (ASCII, "N"),
+        2: (SRATIONAL, struct.pack("<2i", -(2**31), 1)),
+        3: (RATIONAL, struct.pack("<2I", 1, 0)),
+        4: (12, [math.inf]),
+        5: (12, [1e308]),
+        6: (UNDEFINED, bytes(60_000)),
+        7: (9, [-5]),
+        99: (ASCII, "N"),
+    }
+    Image.new("RGB", (64, 48), "grey").save(tmp_path / "x.jpg", exif=b"Exif\0\0" + laid_out({GPS: hostile}))
+
+    found = gps_directory(tmp_path / "x.jpg")
+
+    assert found == {1: (ASCII, b"N\0"), 7: (9, (-5,))}
+    assert gps_directory(corrected(tmp_path / "x.jpg", tmp_path / "kept", "jpeg", gps=found)) == found
 
 
 def opcode_lists(path: Path) -> list[bytes]:

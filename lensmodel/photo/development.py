@@ -24,7 +24,8 @@ from lensmodel.core.types import CHANNELS, Frame, LensSettings, NoiseModel, Plan
 from lensmodel.photo import colour, containers, values
 from lensmodel.photo.containers import COPY_AGAIN
 from lensmodel.photo.metadata import Said
-from lensmodel.photo.sensor import Mosaic, coding_noise, estimate_noise, graininess, replace_defects
+from lensmodel.photo.mosaic import Mosaic, replace_defects
+from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.writing import OPCODES_2, OPCODES_3, Pixels, opcodes_of_planes
 
 MIN_SIDE = 16  # smaller pictures are icons, not photos

@@ -30,8 +30,7 @@ from lensmodel.core.errors import (
     UnsupportedFormatError,
 )
 from lensmodel.photo.colour import named_profile, read_profile
-from lensmodel.photo.containers import BYTE, LONG, Tag, Tags, laid_out
-from lensmodel.photo.sensor import require_known_mosaic
+from lensmodel.photo.containers import BYTE, LONG, Tag, Tags, laid_out, require_known_mosaic
 from lensmodel.photo.writing import write_bayer_dng
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"

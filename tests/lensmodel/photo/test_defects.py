@@ -15,7 +15,7 @@ from lensmodel import calibrate, correct, photo, simulate
 from lensmodel.core.errors import RawDecodeError, UnsupportedFormatError
 from lensmodel.core.types import LensSettings, Zone
 from lensmodel.photo.containers import BYTE, SHORT, write_strip
-from lensmodel.photo.sensor import replace_defects
+from lensmodel.photo.mosaic import replace_defects
 from lensmodel.photo.writing import dng_tags, write_bayer_dng
 
 CAMERA = simulate.SimulatedCamera(height=400, width=600)

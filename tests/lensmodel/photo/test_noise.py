@@ -15,7 +15,7 @@ from lensmodel import photo
 from lensmodel.core.types import NoiseModel
 from lensmodel.photo.colour import curves_of, srgb_to_linear
 from lensmodel.photo.containers import opened_header
-from lensmodel.photo.sensor import estimate_noise, graininess
+from lensmodel.photo.noise import estimate_noise, graininess
 from lensmodel.photo.writing import write_bayer_dng
 
 BLACK, WHITE = 512, 15000

@@ -249,7 +249,8 @@ def _log_widths(sample: PsfSample) -> tuple[float, float]:
     return float(0.5 * np.log(max(uu, 0.04))), float(0.5 * np.log(max(vv, 0.04)))
 
 
-_FINER = 2  # coefficients for each pixel along an axis (chosen)
+_FINER = 2  # coefficients for each pixel along an axis (chosen); 1 where memory is short
+_MOST_BYTES = 1 << 29  # beyond, kernels are kept no finer than their pixels
 
 # Degree of the spline that fills the finer grid, and of that of kernels with more contrast at the Nyquist
 # frequency (chosen): turned by 45 degrees, a Gaussian of .8 px would be off by 3 % with a cubic one, by .6 %
@@ -283,23 +284,25 @@ class LocalKernels:
     """Splines of the samples with the frames that they belong to."""
 
     side: int  # odd side of the stored kernels
-    splines: NDArray[np.float32]  # (n, (2 (side - 1) + 1 + 2 rims)^2), coefficients
+    splines: NDArray[np.float32]  # (n, (finer (side - 1) + 1 + 2 rims)^2), coefficients
     angles: Array  # (n,), phi of the places in radians
     radii: Array  # (n,), of the light in steps of the grid
     widths: Array  # (n, 2), scales (s_u, s_v) of the places
+    finer: int  # coefficients for each pixel along an axis
 
     @classmethod
     def of(cls, samples: Sequence[PsfSample], where: Array, field: WidthField) -> LocalKernels:
         """Keep samples at points `where` (n, 7)."""
         side = max(s.kernel.shape[0] for s in samples)
-        stored = np.empty((len(samples), (_FINER * (side - 1) + 1 + 2 * _RIM) ** 2), dtype=np.float32)
+        finer = _FINER if 4 * (_FINER * (side - 1) + 1) ** 2 * len(samples) <= _MOST_BYTES else 1
+        stored = np.empty((len(samples), (finer * (side - 1) + 1 + 2 * _RIM) ** 2), dtype=np.float32)
         radii = np.empty(len(samples))
         for i, sample in enumerate(samples):
-            spline = coefficients(resized(sample.kernel, side))
+            spline = coefficients(resized(sample.kernel, side), finer)
             lit = np.argwhere(np.abs(spline) > _LIGHT * np.abs(spline).max()) - spline.shape[0] // 2
             stored[i], radii[i] = np.pad(spline, _RIM).ravel(), np.hypot(*lit.T).max() + _SPLINE_REACH
         angles = np.array([s.position.phi for s in samples])
-        return cls(side, stored, angles, radii, field.over(where))
+        return cls(side, stored, angles, radii, field.over(where), finer)
 
     def kernels(self, answers: Answers, angles: Array, widths: Array, size: int) -> Array:
         """Means of the neighbours at places of `angles` (q,) and `widths` (q, 2), shape (q, size, size).
@@ -332,7 +335,7 @@ class LocalKernels:
         """Weighted sums of the samples of each answer, which may be negative and off the centre."""
         rows, asked = answers.rows, np.repeat(np.arange(len(angles)), answers.counts)
         scale = self.widths[rows] / widths[asked]
-        maps = _frames(self.angles[rows]).mT @ ((scale * _FINER)[:, :, None] * _frames(angles[asked]))
+        maps = _frames(self.angles[rows]).mT @ ((scale * self.finer)[:, :, None] * _frames(angles[asked]))
         factors = answers.weights * scale[:, 0] * scale[:, 1]
         starts = np.concatenate([[0], np.cumsum(answers.counts)])
         out = np.zeros((len(angles), size, size))
@@ -358,25 +361,25 @@ def _frames(angles: Array) -> Array:
     return np.stack([np.stack([-s, c], axis=-1), np.stack([-c, -s], axis=-1)], axis=-2)
 
 
-def coefficients(kernel: NDArray[np.floating]) -> Array:
-    """Coefficients of the spline through the pixels of a kernel, `(k, k)` to `(2 (k - 1) + 1,) * 2`."""
+def coefficients(kernel: NDArray[np.floating], finer: int) -> Array:
+    """Coefficients of the spline through the pixels of a kernel, `(k, k)` to `(finer (k - 1) + 1,) * 2`."""
     turns = 1.0 - 2.0 * (np.arange(kernel.shape[0]) % 2)
     contrast = max(abs(float(turns @ kernel.sum(axis=axis))) for axis in (0, 1)) / float(kernel.sum())
-    refining = _refining(kernel.shape[0], _DEGREE_OF_SHARP if contrast > _SHARP else _DEGREE)
+    refining = _refining(kernel.shape[0], _DEGREE_OF_SHARP if contrast > _SHARP else _DEGREE, finer)
     return np.asarray(refining @ kernel @ refining.T)
 
 
 @lru_cache(maxsize=16)
-def _refining(side: int, degree: int) -> Array:
+def _refining(side: int, degree: int, finer: int) -> Array:
     """Matrix from the pixels of an axis to the coefficients of the finer grid, zeros around both."""
     half = side // 2
-    fine = np.arange(-half * _FINER, half * _FINER + 1)
+    fine = np.arange(-half * finer, half * finer + 1)
     pixels = np.pad(np.eye(side), ((_MARGIN, _MARGIN), (0, 0)))
     through = scipy.interpolate.make_interp_spline(
         np.arange(-half - _MARGIN, half + _MARGIN + 1), pixels, k=degree
     )
     sampling = (4.0 * np.eye(fine.size) + np.eye(fine.size, k=1) + np.eye(fine.size, k=-1)) / 6.0
-    return np.asarray(np.linalg.inv(sampling) @ through(fine / _FINER))
+    return np.asarray(np.linalg.inv(sampling) @ through(fine / finer))
 
 
 # Of the cubic B-spline (M. Unser, IEEE Signal Processing Magazine 16, 1999, eq. 4), in single precision.

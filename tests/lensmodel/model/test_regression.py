@@ -15,7 +15,7 @@ from lab.model_benchmark import pixel_to_local, run_model_benchmark
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, centroid, delta, second_moments
 from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings
-from lensmodel.model import LensModel
+from lensmodel.model import LensModel, regression
 from lensmodel.model import query as va
 from lensmodel.model.query import MODES, bandwidths
 from lensmodel.model.regression import (
@@ -146,10 +146,11 @@ def test_long_axis_turns_with_the_place() -> None:
         assert math.degrees(math.acos(min(aligned, 1.0))) < 2.0
 
 
-def test_spline_goes_through_the_pixels() -> None:
+@pytest.mark.parametrize("finer", [1, 2])
+def test_spline_goes_through_the_pixels(finer: int) -> None:
     kernel = np.random.default_rng(2).random((11, 11))
-    stored = np.pad(coefficients(kernel), 3).astype(np.float32).reshape(1, -1)
-    row, whole, at = np.zeros(1, dtype=np.intp), np.array([0, 1]), np.eye(2)[None] * 2.0
+    stored = np.pad(coefficients(kernel, finer), 3).astype(np.float32).reshape(1, -1)
+    row, whole, at = np.zeros(1, dtype=np.intp), np.array([0, 1]), np.eye(2)[None] * finer
     read = np.zeros((1, 11, 11))
 
     spline_sums(stored, np.full(1, 99.0), row, np.ones(1), at, whole, np.zeros((1, 2)), read)
@@ -297,6 +298,17 @@ def test_a_sample_takes_25_bytes_a_pixel() -> None:
     samples = photos(20)
 
     assert LensModel.fit(samples).nbytes < 25 * SIZE * SIZE * len(samples) + 8 * 800 * SIZE * SIZE
+
+
+def test_many_large_kernels_are_kept_no_finer_than_their_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples, fine = photos(4), LensModel.fit(photos(4))
+    monkeypatch.setattr(regression, "_MOST_BYTES", 4 * SIZE * SIZE * len(samples))
+
+    coarse = LensModel.fit(samples)
+
+    assert coarse.nbytes < 0.6 * fine.nbytes
+    for where in places(5, 7):
+        assert distance(coarse.query(where, GREEN, SIZE).kernel, truth(where)).rel_l2 < 0.1
 
 
 # ---- bad photos, and what it says of itself

@@ -60,6 +60,13 @@ class Identity:
         """Whether there is more than a maker, which says nothing of the lens."""
         return bool(self.names.get("model") or self.names.get("serial"))
 
+    @property
+    def is_built_in(self) -> bool:
+        """Whether the lens is part of a camera: it names itself after it."""
+        model = name_key(self.names.get("model"))
+        after = any(key in model for camera in self.cameras if (key := name_key(camera.model)))
+        return after and not self.names.get("serial")
+
 
 def difference(lens: Identity, other: Identity) -> str | None:
     """Say why a photo, or another lens, cannot be, or need not be, of a lens; None where nothing says so.
@@ -67,7 +74,7 @@ def difference(lens: Identity, other: Identity) -> str | None:
     What both name of the lens must agree. Where only the other names its lens it is another one, unless the
     owner labelled the lens, or nothing at all is known of it. Where one names none, both must have been seen
     on one model of camera, of which a lens may be part, at about one focal length, but for compacts that
-    zoom; and where none does, on one body.
+    zoom; and where none does, or a lens names itself after its camera, on one body.
     """
     for name, (key, words) in _NAMED.items():
         ours, theirs = lens.names.get(name), other.names.get(name)
@@ -85,8 +92,9 @@ def difference(lens: Identity, other: Identity) -> str | None:
             f"it was taken with another camera, {_models(other)}, and the photos of the known lens with "
             f"{_models(lens)}, and not both name their lens"
         )
+    built_in = other.is_built_in if other.names_lens else not lens.names_lens
     bodies = [{serial_key(pair[k].serial) for pair in alike if pair[k].serial} for k in (0, 1)]
-    if not (lens.names_lens or other.names_lens) and all(bodies) and not bodies[0] & bodies[1]:
+    if built_in and all(bodies) and not bodies[0] & bodies[1]:
         return "it was taken with another copy of the camera, and nothing says that the lens is the same"
     focals = [*lens.focals_mm, *other.focals_mm]
     if unnamed and lens.focals_mm and other.focals_mm and not (alike and min(focals) < _COMPACT_MM):

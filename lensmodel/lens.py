@@ -161,7 +161,13 @@ class Lens:
 
         `r` and `phi` have shapes that broadcast to one shape S.
         """
-        radii, angles = np.broadcast_arrays(np.asarray(r, np.float64), np.asarray(phi, np.float64))
+        radii, angles = np.asarray(r, dtype=np.float64), np.asarray(phi, dtype=np.float64)
+        try:
+            radii, angles = np.broadcast_arrays(radii, angles)
+        except ValueError as error:
+            raise InvalidInputError(
+                f"r and phi must have shapes that broadcast, got {radii.shape} and {angles.shape}"
+            ) from error
         places = [FieldPosition(*at) for at in zip(radii.flat, angles.flat, strict=True)]
         flat = self.model.kernels(places, LensSettings(**settings), size)
         return flat.reshape(*radii.shape, size, size)

@@ -132,6 +132,11 @@ def test_frequencies_that_no_contrast_has_are_refused(frequencies: Any, lens: Le
         lens.mtf(0.5, 0.0, frequencies)
 
 
+def test_places_whose_shapes_do_not_fit_are_refused(lens: Lens) -> None:
+    with pytest.raises(InvalidInputError, match=r"\(2,\) and \(3,\)"):
+        lens.kernels([0.1, 0.2], [0.0, 1.0, 2.0])
+
+
 # --- arrays in, arrays out; methods of one's own ----------------------------------------------
 
 

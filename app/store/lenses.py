@@ -77,6 +77,8 @@ TEACHES: Final = PhotoRow.state == "counted"
 # How long the previous version is kept (chosen): a worker may still be reporting of it
 STILL_WRITTEN: Final = timedelta(minutes=30)
 
+REPORT_FORM: Final = 2  # of the JSON of `LensReport`: raised when that of before can no longer be read
+
 
 @dataclass(frozen=True, slots=True)
 class LensName:
@@ -338,7 +340,8 @@ def note_change(session: Session, photo: PhotoRow, kind: str) -> int:
     # Its samples and photos are counted anew, never incremented
     lens = session.get_one(LensRow, photo.lens_id)
     if lens.version:  # before the first there was nothing to report
-        discard(session, report_key(lens.public_id, lens.version, lens.rebuild_epoch), after=STILL_WRITTEN)
+        reports = report_key(lens.public_id, lens.version, lens.rebuild_epoch).rpartition("/")[0]
+        discard(session, f"{reports}/", after=STILL_WRITTEN)  # in each form
     lens.version += 1
     # where samples went away or changed, models in memory are fitted anew instead of extended
     lens.rebuild_epoch += kind != "photo_added"
@@ -390,7 +393,7 @@ def move_photo(session: Session, photo: PhotoRow, lens: LensRow) -> None:
 
 def report_key(lens_id: str, version: int, epoch: int) -> str:
     """Return the key of the report that a worker makes of one version of a lens."""
-    return f"models/{lens_id}/{version}-{epoch}/report.json"
+    return f"models/{lens_id}/{version}-{epoch}/report-{REPORT_FORM}.json"
 
 
 # --- deletion -------------------------------------------------------------------------------------

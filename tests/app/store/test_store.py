@@ -184,7 +184,7 @@ def test_deleting_a_photo_forgets_its_samples_and_names_its_blobs(store: Store, 
     assert {stored.photo for stored in steps.learned(other)[1]} == {other.public_id}
     assert store.jobs.garbage() == []  # a worker may still write: once more in a while
     late = datetime.now(UTC) + timedelta(hours=1)
-    models = {f"models/{lens}/{version}-0/report.json" for version in (1, 2)}
+    models = {f"models/{lens}/{version}-0/" for version in (1, 2)}
     assert set(store.jobs.garbage(at=late)) == {f"photos/{photo.public_id}/"} | models
     history = [event.kind for event in store.lenses.history(steps.lens(other))]
     assert history == ["photo_added", "photo_added", "photo_removed"]

@@ -77,6 +77,10 @@ def _targets(output: Path | None) -> tuple[Path, ...]:
         return ()
     if output.suffix.lower() in FORMS and not output.is_dir():
         return (output,)
+    if output.suffix[1:].isalpha() and not output.is_dir():
+        raise UsageError(
+            f"a report is no {output.suffix}: end {output} in {', '.join(FORMS)}, or give a folder"
+        )
     return tuple(output / f"report{form}" for form in FORMS)
 
 

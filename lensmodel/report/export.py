@@ -21,13 +21,15 @@ from lensmodel.core.types import LensSettings
 from lensmodel.model import LensModel
 from lensmodel.report.centring import EDGE_R
 from lensmodel.report.lens_report import (
-    DEFAULT_ASPECT,
     DIRECTIONS,
     UNIT_NAMES,
     ApertureReport,
     LensReport,
+    filled_aspect,
     grid,
 )
+
+_MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the memory (chosen)
 
 PsfGrid: TypeAlias = dict[str, Any]
 """Arrays of n = rows * cols places, row by row from the top left: `psf` (n, k, k) float32; `r` in half
@@ -37,7 +39,11 @@ diagonals, `phi` in radians counter-clockwise from the right, `error`, the expec
 
 def psf_grid(model: LensModel, settings: LensSettings, *, rows: int, cols: int, size: int) -> PsfGrid:
     """Ask a model for the kernels of a grid of places."""
-    places = grid(rows, cols, DEFAULT_ASPECT)
+    if 4 * rows * cols * size * size > _MOST_BYTES:
+        raise InvalidInputError(
+            f"{rows} x {cols} kernels of side {size} are too many; ask for at most {_MOST_BYTES >> 20} MiB"
+        )
+    places = grid(rows, cols, filled_aspect(model))
     answers = [model.query(place, settings, size) for place in places]
     return {
         "psf": np.array([answer.kernel for answer in answers], np.float32),

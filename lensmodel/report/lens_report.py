@@ -27,8 +27,7 @@ from lensmodel.neural.network import RING_MIDDLES
 from lensmodel.quality import crossing, mtf50_from_kernel, mtf_from_kernel
 from lensmodel.report.centring import Centring, centring
 
-# Width over height of a 35 mm frame: its corners lie within those of other cameras, and a profile does not
-# say how wide its photos were
+# Width over height of a 35 mm frame; a profile does not say how wide its photos were
 DEFAULT_ASPECT: Final = 1.5
 Unit = Literal["c/px", "lp/ph", "lp/mm"]
 UNIT_NAMES: Final[dict[Unit, str]] = {
@@ -60,6 +59,9 @@ MARKED: Final = (
     *("centre", "left", "right", "top", "bottom"),
     *("upper left corner", "upper right corner", "lower left corner", "lower right corner"),
 )
+_ASPECTS: Final = (1.0, 4 / 3, 1.5, 16 / 9)
+_FILLED: Final = 0.85  # of the way to a side that samples reach at least (chosen: patches end short of it)
+_NAMED: Final = 8  # photos that a report names (chosen: two lines)
 _CAUTION: Final = "Caution"  # name among the details of a report of what to allow for in its figures
 # Expected relative L2 of a kernel that another photo would not better by what is seen (chosen)
 _WELL_KNOWN: Final = 0.1
@@ -194,7 +196,7 @@ class LensReport:
     places: int  # at which these show the blur, in the colour that most of them show
     sensor: SensorGeometry  # for other units than cycles/pixel
     tested: tuple[ApertureReport, ...]  # by aperture, ascending
-    # what else stands on the page: camera, serial, a caution
+    # what else stands on the page: camera, serial, names of photos, a caution
     details: Mapping[str, str] = field(default_factory=dict)
 
     def at(self, aperture: float | None) -> ApertureReport:
@@ -246,9 +248,12 @@ def caution(photos: Sequence[str]) -> str:
 
 def provenance(serial: str | None, cameras: Iterable[str], photos: Sequence[str]) -> dict[str, str]:
     """Say on which copy and photos a report rests, when and by what it was written; a caveat for JPEG."""
+    names = sorted(photos)
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     details = {
         "Serial number": serial or "",
         "Camera": ", ".join(dict.fromkeys(filter(None, cameras))),
+        "Photos": ", ".join(names[:_NAMED]) + more,
         _CAUTION: caution(photos),
         "Written": f"{datetime.now(UTC):%Y-%m-%d} by lensmodel {version('lensmodel')}",
     }
@@ -259,7 +264,7 @@ def lens_report(
     model: LensModel,
     name: str,
     *,
-    aspect: float = DEFAULT_ASPECT,
+    aspect: float | None = None,
     height_px: int | None = None,
     apertures: Sequence[float] | None = None,
     rows: int = _ROWS,
@@ -271,6 +276,7 @@ def lens_report(
     `aspect` is the width over height of its photos, `height_px` their height in pixels, by default what its
     samples come to; `rows` counts those of the maps, `size` is the odd side of the kernels in pixels.
     """
+    aspect = filled_aspect(model) if aspect is None else aspect
     cols = max(3, round(rows * aspect))
     places = [*marked_places(aspect).items(), *(("", at) for at in grid(rows, cols, aspect))]
     numbers = _chosen(model) if apertures is None else apertures
@@ -441,6 +447,18 @@ def _chosen(model: LensModel) -> list[float]:
 def _shared(values: Iterable[float | None]) -> float | None:
     known = set(values)
     return next(iter(known)) if len(known) == 1 else None
+
+
+def filled_aspect(model: LensModel) -> float:
+    """Aspect of common sensors whose sides the samples reach alike; 3:2 where they leave its sides free.
+
+    A chart has a shape of its own, and says nothing of the frame's.
+    """
+    places = [s.position.xy for s in model.samples if not s.measured] or [(0.0, 0.0)]
+    reached = np.abs(places).max(axis=0)
+    shares = {aspect: reached / half_sides(aspect) for aspect in _ASPECTS}
+    inside = [a for a, share in shares.items() if share.max() <= 1.0 and share.min() > _FILLED]
+    return min(inside, key=lambda a: float(np.ptp(shares[a])), default=DEFAULT_ASPECT)
 
 
 # --- places of the field -------------------------------------------------------------------------

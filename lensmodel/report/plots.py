@@ -38,7 +38,8 @@ _A_PAGE: Final = 2  # panels below each other on a page: those of one aperture
 _HATCHED: Final[dict[str, Any]] = {"facecolor": "#f4f4f2", "edgecolor": "#a8a8a2", "hatch": "////", "lw": 0}
 _LUMA: Final = (0.2126, 0.7152, 0.0722)  # of red, green and blue (ITU-R BT.709)
 _PALE: Final = 0.45  # luma from which on dark figures are read best (chosen)
-_SHOWN: Final = 9  # pixels shown around a point on each side (chosen)
+_SEEN: Final = 0.01  # of the brightest pixel of a point: darker ones look black (chosen)
+_LEAST_HALF: Final = 5  # pixels shown around a point on each side, at least (chosen)
 _STYLE: Final[dict[str, Any]] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
@@ -210,10 +211,13 @@ def _empty(ax: Axes) -> None:
 def _points(found: ApertureReport, place: Place) -> None:
     """What becomes of a point in the centre and in each corner; the worst one's name is bold."""
     spots = (found.spots[0], *found.corners)
-    for ax, spot in zip(place.subplots(1, len(spots)), spots, strict=True):
-        cut = max(len(spot.kernel) // 2 - _SHOWN, 0)
-        near = slice(cut, len(spot.kernel) - cut)
-        ax.imshow(np.array(spot.kernel)[near, near], cmap="gray", vmin=0.0)
+    kernels = np.array([spot.kernel for spot in spots])
+    middle = kernels.shape[1] // 2
+    bright = np.argwhere(kernels > _SEEN * kernels.max(axis=(1, 2), keepdims=True))[:, 1:]
+    half = min(max(_LEAST_HALF, int(np.abs(bright - middle).max())), middle)
+    near = slice(middle - half, middle + half + 1)
+    for ax, spot, kernel in zip(place.subplots(1, len(spots)), spots, kernels, strict=True):
+        ax.imshow(kernel[near, near], cmap="gray", vmin=0.0)
         name = spot.place + ("\n(not known)" if spot.unknown else "")
         ax.set_title(name, weight="bold" if spot is found.worst else "normal", va="bottom")
         ax.set_xlabel(spot.words.replace(", S", "\nS"), fontsize=7.5)

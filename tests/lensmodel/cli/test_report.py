@@ -90,9 +90,10 @@ def test_a_name_that_ends_as_a_form_is_that_file_alone(folder: Path, few_places:
 def test_the_page_says_what_it_rests_on() -> None:
     found = provenance("12", ["Canon EOS 6D", "Canon EOS 6D", ""], ["b.dng", "a.jpg"])
 
-    assert found | {"Serial number": "12", "Camera": "Canon EOS 6D"} == found
+    assert found | {"Serial number": "12", "Camera": "Canon EOS 6D", "Photos": "a.jpg, b.dng"} == found
     assert found["Caution"].startswith("Learned from JPEG files (1 of 2 photos): the camera's sharpening")
     assert not {"Caution", "Serial number"} & provenance(None, [], ["b.dng"]).keys()
+    assert provenance(None, [], [f"{k}.dng" for k in range(20)])["Photos"].endswith("and 12 more")
 
 
 def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:
@@ -113,6 +114,7 @@ def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:
 @pytest.mark.parametrize(
     "words",
     [
+        ("report", NAME, "-o", "mine.html"),
         ("report", NAME, "-o", "out", "--against", "nobodys.lensprofile"),
         ("report", "nobodys.lensprofile", "-o", "out"),
         ("target", "."),

@@ -104,3 +104,8 @@ def test_a_single_place_is_the_middle(model: LensModel) -> None:
 
     assert one["r"].tolist() == [0.0]
     assert np.hypot(*centroid(one["psf"][0].astype(np.float64))) < 2e-3
+
+
+def test_grids_too_large_for_memory_are_refused(model: LensModel) -> None:
+    with pytest.raises(InvalidInputError, match="512 MiB"):
+        psf_grid(model, SETTINGS, rows=100, cols=100, size=255)

@@ -20,7 +20,7 @@ from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import from_json, to_json
 from lensmodel.core.psf import PsfSample, delta
-from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
+from lensmodel.core.types import CHANNELS, FieldPosition, Frame, LensSettings
 from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.quality import mtf50_from_kernel
 from lensmodel.report.centring import Asymmetry, Centring, direction_in_words
@@ -30,6 +30,7 @@ from lensmodel.report.lens_report import (
     LensReport,
     SensorGeometry,
     compare,
+    filled_aspect,
     half_sides,
     lens_report,
     marked_places,
@@ -282,6 +283,18 @@ def test_apertures_are_tested_each_and_the_best_is_named() -> None:
     assert found.at(8.0).zones["corner"] > found.at(2.8).zones["corner"]
     assert "It is sharpest over the whole picture at f/8." in found.verdict
     assert charts(found, None)[-1].title == "MTF50 by aperture"
+
+
+@pytest.mark.parametrize(("height", "width"), [(2000, 2000), (2128, 2832), (2160, 3840)])
+@pytest.mark.parametrize("margin", [40, 96])
+def test_the_shape_of_a_picture_is_that_which_its_samples_fill(height: int, width: int, margin: int) -> None:
+    frame = Frame(height, width)
+    rows, cols = (np.linspace(margin, side - 1 - margin, 8).tolist() for side in (height, width))
+    filled = [PsfSample(delta(5), frame.position(*at), photo="a") for at in itertools.product(rows, cols)]
+
+    assert filled_aspect(LensModel.fit(filled, QUICK)) == pytest.approx(width / height, rel=0.01)
+    middle = [sample for sample in filled if sample.position.r < 0.6]
+    assert filled_aspect(LensModel.fit(middle, QUICK)) == 1.5  # nothing tells
 
 
 @pytest.mark.parametrize("aspect", [1.0, 16 / 9, 2 / 3, 5.0])

@@ -17,6 +17,7 @@ from lensmodel.cli import console, files
 from lensmodel.cli.console import Display, UsageError
 from lensmodel.core import processes
 from lensmodel.core.types import LensSettings
+from lensmodel.patches import selectors
 
 
 def calibrate(
@@ -30,6 +31,11 @@ def calibrate(
     estimator: Annotated[
         str | None, typer.Option(help=f"{', '.join(estimators)}; default: that of the model.")
     ] = None,
+    kernel_size: Annotated[
+        int | None,
+        typer.Option(help="Side of the kernels, odd, 3 to 55; default: 31, with --model paper 55."),
+    ] = None,
+    selector: Annotated[str, typer.Option(help=f"Of patches: {', '.join(selectors)}.")] = "r-map",
     workers: console.Workers = None,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask cluster that estimates the photos.")
@@ -62,7 +68,10 @@ def calibrate(
     files.refuse_photo(profile, paths)
     store = files.ProfileFile(profile, model, force=force)
     with files.as_usage():
-        config = configured(store.model, LensSettings(aperture=aperture), estimator=estimator)
+        given = LensSettings(aperture=aperture)
+        config = configured(
+            store.model, given, estimator=estimator, kernel_size=kernel_size, selector=selector
+        )
     results: list[dict[str, Any]] = []
     with shown.progress(total=len(paths)) as bar:
 

@@ -1,12 +1,14 @@
 """What all commands share: what they say, how they end, and their options.
 
-Results go to standard output, all else to standard error, progress to terminals alone.
+Results go to standard output, all else to standard error; progress is a bar on a terminal and plain lines
+elsewhere.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import math
 import multiprocessing
 import os
 import signal
@@ -26,6 +28,8 @@ from lensmodel.core import types
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import to_json
 
+# A line in so many seconds (chosen): a night's log stays readable, and quick commands silent
+EVERY_S: Final = 10.0
 COMPILING = "lensmodel.correction.whole_photo.first_use"  # Logs when loops are compiled, once on a machine
 
 
@@ -79,7 +83,7 @@ class Display:
         typer.echo(f"lensmodel: {text}", err=True)
 
     def progress(self, text: str = "", total: float | None = None) -> Bar:
-        """One bar with share and time left, on a terminal alone."""
+        """One bar with share and time left; plain lines now and then where no terminal can show it."""
         bar = Bar(
             TextColumn("{task.description}", markup=False),  # names of files may hold brackets
             *Progress.get_default_columns()[1:],
@@ -89,16 +93,24 @@ class Display:
             redirect_stdout=sys.stdout.isatty(),  # a pipe or file gets its results untouched
         )
         bar.add_task(text, total=total)
+        bar.last, bar.every_s = bar.get_time(), math.inf if self.quiet or not bar.disable else EVERY_S
         return bar
 
 
 class Bar(Progress):
     """The progress of one task."""
 
+    every_s = math.inf  # seconds between lines where no terminal shows the bar, and when there was one
+    last = 0.0
+
     def show(self, completed: float = 0.0, **changes: Any) -> None:  # noqa: ANN401 - as `Progress.update` takes them
         """Change what is shown; what was done of a photo that is then passed over stays done."""
         (task,) = self.tasks
         self.update(task.id, completed=max(completed, task.completed), **changes)
+        if self.get_time() - self.last >= self.every_s:
+            self.last = self.get_time()
+            share = f"{task.percentage:3.0f} % " if task.total else ""
+            typer.echo(f"[{clock(task.elapsed or 0.0)}] {share}{task.description or 'working'}", err=True)
 
     def part(self, number: int, done: int, total: int, description: str | None = None) -> None:
         """Show that photo `number` is done as far as `done` of `total`."""

@@ -157,7 +157,7 @@ def targets_of(
         if file_format is not None and EXTENSION[FORMATS[named.suffix.lower()]] != extension:
             raise UsageError(f"{named.name} is no name for --format {file_format}; end it in {extension}")
         return {paths[0]: named}
-    if named.is_file():
+    if output is not None and named.is_file():
         raise UsageError(f"{named} is a file; give a folder to -o")
     folders = {path: path.parent / FOLDER if output is None else named for path in paths}
     return {path: folder / f"{path.stem}{CORRECTED}{extension}" for path, folder in folders.items()}
@@ -406,6 +406,11 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
         said = ", ".join(f"{name.replace('_', ' ')} {number}" for name, number in counts.items())
         names = ", ".join(group.words.values())
         display.result(f"{names}: {said}, expected gain {gain_words(gain)}")
+        if number == 1:
+            display.note(
+                "it was learned from one photo; with five or more its blur is known better, and scenes do not"
+                " pass for it"
+            )
     if any(row["corrected"] for row in rows):
         where = ", ".join(sorted({str(target.parent) for target in correction.targets.values()}))
         display.note(f"corrected photos are in {where}, lens profiles in {profiles}")

@@ -47,12 +47,16 @@ def photos(names: Iterable[Path], note: Callable[[str], None]) -> list[Path]:
 
 
 def _shot(path: Path) -> tuple[Path, str]:
-    """Name the shot of a file: IMG_1.DNG and img_1.jpg, x.RAW-02.ORIGINAL.dng and x.RAW-01.COVER.jpg."""
-    return path.parent, _PART_OF_SHOT.sub("", path.stem).casefold()
+    """Name the shot of a file: IMG_1.DNG and img_1.CR2.jpg, x.RAW-02.ORIGINAL.dng and x.RAW-01.COVER.jpg."""
+    inner = Path(path.stem)
+    stem = inner.stem if inner.suffix.lower() in RAW_ENDINGS else path.stem
+    return path.parent, _PART_OF_SHOT.sub("", stem).casefold()
 
 
 def refuse_photo(target: Path, photos: Sequence[Path]) -> None:
-    """Refuse a profile that would take the place of a photo."""
+    """Refuse a profile that would take the place of a folder or a photo."""
+    if target.is_dir():
+        raise UsageError(f"{target} is a folder; give the file of a lens profile")
     # a shell expands `--profile holiday/*.dng` to a profile and photos
     if target.suffix.lower() in ENDINGS or any(
         target.exists() and path.exists() and target.samefile(path) for path in photos

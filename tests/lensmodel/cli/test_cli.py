@@ -33,7 +33,7 @@ from scipy import ndimage
 from lab.kernels import gaussian
 from lensmodel import photo
 from lensmodel.blind import sampling
-from lensmodel.cli import files
+from lensmodel.cli import console, files
 from lensmodel.cli.correct import targets_of
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -54,8 +54,10 @@ Here = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture
-def here(folder: Path) -> Here:
+def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Here:
     """Run `main` in this process, in that folder: saves two seconds of imports where nothing is lost."""
+    # a command that is quick says nothing of its progress, and a busy machine makes none slow
+    monkeypatch.setattr(console, "EVERY_S", stretched(console.EVERY_S))
     return partial(in_process.lensmodel, cwd=folder)
 
 
@@ -185,6 +187,7 @@ SHOTS = {
         ["P.RAW-01.MP.COVER.jpg", "P.RAW-02.ORIGINAL.dng", "P2.jpg"],
         ["P.RAW-02.ORIGINAL.dng", "P2.jpg"],
     ),
+    "both endings": (["a.CR2", "a.CR2.jpg", "A.cr2.tif"], ["a.CR2"]),
     "others": (["a.jpg", "a1.dng", "b.RAWS.jpg"], ["a.jpg", "a1.dng", "b.RAWS.jpg"]),
     "corrected": (["a.jpg", "a-corrected.dng"], ["a.jpg"]),
 }
@@ -419,15 +422,17 @@ def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
 ) -> None:
     new = "paper.lensprofile"
     words = ("calibrate", "one.dng", "-p", new, "--workers", "1", "--any-lens", "--json")
-    quick = ("--estimator", "default")
+    quick = ("--estimator", "default", "--kernel-size", "21")
     result = json.loads(here(*words, *quick, "--model", "paper").stdout)
 
     kept = Lens.load(folder / new).model
     assert (result["model"], kept.mode) == ("paper", "paper")
+    assert max(sample.kernel.shape for sample in kept.samples) <= (21, 21)
     assert json.loads(here(*words, *quick).stdout)["model"] == "paper"
     assert here("correct", "one.dng", "-p", new, "-o", "out").returncode == 0
     with Image.open(folder / "out" / "one-corrected.tif") as written:
         assert "method paper" in str(written.tag_v2.get(270))
+    assert here(*words, "--kernel-size", "57").returncode == 2
     # kernels of the two models are not to be mixed
     for profile, asked, has in ((new, "default", "paper"), (PROFILE, "paper", "default")):
         refused = here("calibrate", "one.dng", "-p", profile, "--any-lens", *quick, "--model", asked)
@@ -484,7 +489,7 @@ def test_stopped_calibration_keeps_finished_photos_and_goes_on(
         write_jpeg(folder / name, seed)
     profile = folder / "new.lensprofile"
     words = ("calibrate", "one.jpg", "two.jpg", "-p", "new.lensprofile", "--estimator", "default", "--json")
-    process = start(*words, cwd=folder)
+    process = start(*words, "-q", cwd=folder)  # on a slow machine it would tell how far it is
     wait_for(profile.exists)
     os.killpg(process.pid, number)  # the whole group, as a terminal does
     said, errors = process.communicate(timeout=stretched(20))

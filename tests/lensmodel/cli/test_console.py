@@ -36,6 +36,20 @@ def test_names_with_brackets_are_shown_whole_and_no_share_falls_where_a_photo_is
     assert "IMG[b].dng" in out.getvalue()
 
 
+def test_without_a_terminal_progress_is_told_in_lines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Display().progress("quick work", 1) as bar:
+        bar.show(1)
+    monkeypatch.setattr(console, "EVERY_S", 0.0)
+    with Display().progress("learning from a.dng", 4) as bar:
+        bar.show(1)
+    with Display(quiet=True).progress("in silence", 4) as bar:
+        bar.show(1)
+
+    assert capsys.readouterr().err == "[0:00:00]  25 % learning from a.dng\n"
+
+
 def test_a_measurement_and_its_report_count_the_same_places(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -275,17 +275,20 @@ def cross_validate(
     counting = np.flatnonzero(base > 0)
     scored = thinned(counting, _SCORED)
     errors, noise = np.full(len(samples), _UNKNOWN_ERROR), np.zeros(len(samples))
-    factors, weights = (1.0, 1.0), base.copy()
+    weights = base.copy()
     if len(scored) < _FEWEST:
-        return weights, errors, noise, factors
+        return weights, errors, noise, (1.0, 1.0)
 
-    def held(rows: NDArray[np.intp]) -> HeldOut:
-        return HeldOut(upright(rows).reshape(len(rows), -1), where[rows], scale, base[rows], groups[rows])
+    def held(rows: NDArray[np.intp], claims: Array) -> HeldOut:
+        return HeldOut(upright(rows).reshape(len(rows), -1), where[rows], scale, claims[rows], groups[rows])
 
-    if mode != PAPER and len(np.unique(photo[counting])) >= _CV_PHOTOS:
+    def searched(claims: Array) -> tuple[float, float]:
+        if mode == PAPER or len(np.unique(photo[counting])) < _CV_PHOTOS:
+            return 1.0, 1.0
         green = counting[where[counting, 4] == WAVELENGTH_NM["g"]]  # it has the least noise
-        factors = held(thinned(green if green.size else counting, _CV_SAMPLES)).best_factors()
-    prepared = held(scored)
+        return held(thinned(green if green.size else counting, _CV_SAMPLES), claims).best_factors()
+
+    factors, prepared = searched(base), held(scored, base)
     known, own_photo = np.unique(photo[scored], return_inverse=True)
     by_sample, by_photo, held_out = prepared.robust(own_photo, factors)
     if mode != PAPER:
@@ -293,6 +296,8 @@ def cross_validate(
         of_photos[known] = by_photo
         weights *= of_photos[photo]
         weights[scored] *= by_sample
+        if min(by_photo.min(), by_sample.min()) < _SPOILT:  # spoilt ones chose as well
+            factors = searched(weights)
     scatter = np.minimum(prepared.noise(prepared.weights(factors)), held_out**2)
     errors[:], noise[:] = float(np.median(held_out)), float(np.median(scatter))
     errors[scored], noise[scored] = held_out, scatter

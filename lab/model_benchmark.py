@@ -34,7 +34,8 @@ from lensmodel.core.types import (
     zone_of,
 )
 from lensmodel.model import LensModel, query
-from lensmodel.model.query import MODES, reference_bandwidth
+from lensmodel.model.bandwidths import reference_bandwidth
+from lensmodel.model.query import MODES
 from lensmodel.simulate import draw_lens
 
 FRAME: Final = Frame(2832, 4256)  # 12 megapixels, 3:2 (chosen)

@@ -45,6 +45,7 @@ from lensmodel.core.numerics import jit, on_simplex
 from lensmodel.core.psf import PsfSample, resized, second_moments
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, query
+from lensmodel.model.bandwidths import bandwidths, cross_validate, thinned
 from lensmodel.model.query import PAPER, Array, Part
 
 _KNOWN: Final = [0, 1, 2, 4]  # variables that are never unknown: place and wavelength
@@ -113,7 +114,7 @@ class Regression:
         points = query.points(common)
         self._widths = WidthField() if mode == PAPER else WidthField.fit(common, base)
         self._local = LocalKernels.of(common, points, self._widths)
-        weights, self._held_out, self._scatter, factors = query.cross_validate(
+        weights, self._held_out, self._scatter, factors = cross_validate(
             common, mode, self._local.upright, points, base
         )
         self._where = query.in_units(points)
@@ -121,7 +122,7 @@ class Regression:
         self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
         self._photos = np.array([s.photo for s in samples])
         self.nbytes = self._local.splines.nbytes
-        self._around = Neighbourhood(points, weights, query.bandwidths(points, mode, factors))
+        self._around = Neighbourhood(points, weights, bandwidths(points, mode, factors))
 
     def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:
         """Answer at a place, in pixels of some pitch."""
@@ -214,7 +215,7 @@ class WidthField:
     @classmethod
     def fit(cls, samples: Sequence[PsfSample], weights: Array) -> WidthField:
         """Fit the widths of weighted samples by Huber's weights; one width everywhere below six samples."""
-        rows = query.thinned(np.flatnonzero(weights > 0), _MOST)
+        rows = thinned(np.flatnonzero(weights > 0), _MOST)
         if len(rows) < _MIN_SAMPLES:
             return cls()
         samples = [samples[int(i)] for i in rows]

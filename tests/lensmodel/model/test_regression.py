@@ -17,7 +17,8 @@ from lensmodel.core.psf import PsfSample, centroid, delta, second_moments
 from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, regression
 from lensmodel.model import query as va
-from lensmodel.model.query import MODES, HeldOut, bandwidths
+from lensmodel.model.bandwidths import HeldOut, bandwidths
+from lensmodel.model.query import MODES
 from lensmodel.model.regression import (
     Answers,
     LocalKernels,

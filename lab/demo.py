@@ -30,7 +30,7 @@ from lab.kernels import distance
 from lab.scenes import photograph_of
 from lensmodel.cli.console import Display, UsageError, clock
 from lensmodel.core.errors import LensModelError
-from lensmodel.core.types import ZONE_WORDS, ZONES, FieldPosition, LensSettings, Planes, Zone, zone_of
+from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes, Zone, zone_of
 from lensmodel.photo import develop
 from lensmodel.report.lens_report import SensorGeometry
 from lensmodel.simulate import SimulatedCamera, draw_lens, edge_chart, photograph, write_photo
@@ -207,7 +207,7 @@ def _cells(values: Mapping[Zone, float]) -> str:
 def _edge_rows(before: Mapping[Zone, ZoneSharpness], after: Mapping[Zone, ZoneSharpness]) -> str:
     words = SensorGeometry().words
     return "\n".join(
-        f"| {ZONE_WORDS[zone]} | {words(before[zone].mtf50)} | {words(made.mtf50)} "
+        f"| {'centre' if zone == 'center' else zone} | {words(before[zone].mtf50)} | {words(made.mtf50)} "
         f"| {made.mtf_max:.2f} | {made.overshoot:.1f} % |"
         for zone, made in after.items()
         if zone in before

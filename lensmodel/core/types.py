@@ -35,8 +35,6 @@ WAVELENGTH_NM: Final[dict[Channel, float]] = {"r": 610.0, "g": 540.0, "b": 465.0
 Direction: TypeAlias = Literal["tangential", "sagittal", "oblique"]
 Zone: TypeAlias = Literal["center", "mid", "corner"]
 ZONES: Final[tuple[Zone, ...]] = get_args(Zone)
-ZONE_WORDS: Final[dict[Zone, str]] = {"center": "centre", "mid": "mid", "corner": "corner"}
-"""How a zone is written where people read it."""
 
 BayerPattern: TypeAlias = tuple[tuple[int, int], tuple[int, int]]
 """Channel (0 r, 1 g, 2 b) that each pixel of the top left 2 x 2 measured; it repeats over the frame."""

@@ -44,8 +44,8 @@ MAX_HEAD_BYTES: Final = 64 << 20  # of a JPEG before its picture: phones put who
 Buffer: TypeAlias = bytes | mmap.mmap
 
 # Against files made to cost time or memory (chosen): entries of a directory, of which cameras write below
-# 150; directories, of which they write a dozen; and bytes of a value.
-MAX_ENTRIES, MAX_DIRECTORIES, MAX_VALUE_BYTES = 1024, 64, 16 << 20
+# 150; directories, of which they write a dozen; bytes of a value; and of a text, all of which a JPEG must hold.
+MAX_ENTRIES, MAX_DIRECTORIES, MAX_VALUE_BYTES, MAX_TEXT = 1024, 64, 16 << 20, 4096
 
 ENTRY: Final = 12  # bytes of an entry of a directory
 EXIF, GPS, SUB_DIRECTORIES = (0x8769, 0x8825, 0x014A)  # to directories: Exif 3.0, 4.6.3; TIFF/EP
@@ -110,7 +110,7 @@ class Tags(dict[int, Tag]):
 
     def text(self, tag: int) -> str | None:
         """Text up to the first NUL, stripped; bytes outside UTF-8 read as Latin-1, nothing as `None`."""
-        raw = self.raw(tag).split(b"\0", 1)[0]
+        raw = self.raw(tag)[:MAX_TEXT].split(b"\0", 1)[0]
         try:
             return raw.decode("utf-8").strip() or None
         except UnicodeDecodeError:

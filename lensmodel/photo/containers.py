@@ -44,7 +44,7 @@ MAX_HEAD_BYTES: Final = 64 << 20  # of a JPEG before its picture: phones put who
 Buffer: TypeAlias = bytes | mmap.mmap
 
 # Against files made to cost time or memory (chosen): entries of a directory, of which cameras write below
-# 150; directories, of which they write a dozen; bytes of a value; and of a text, all of which a JPEG must hold.
+# 150; directories, of which they write a dozen; bytes of a value; and of a text, which a JPEG must hold.
 MAX_ENTRIES, MAX_DIRECTORIES, MAX_VALUE_BYTES, MAX_TEXT = 1024, 64, 16 << 20, 4096
 
 ENTRY: Final = 12  # bytes of an entry of a directory

@@ -1,47 +1,25 @@
-"""A lens as one value: what it was calibrated from, what it answers, and the profile that keeps it.
-
-A profile is a zip of JSON and npy that opens anywhere and gives the same PSFs. Layout, format 2::
-
-    profile.json    format, lens, cameras, settings of the model, one entry for each sample
-    kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
-    encoded.npy     (m, bytes) uint8: what patches say without a kernel, see `EncodedPatch`
-
-Nothing in it can run code: no pickle, sizes bounded before arrays are made. Samples cross the service, to
-its tasks and tables, in the same form.
-"""
+"""A lens as one value: what it was calibrated from, what it answers; `model.profile` keeps it."""
 
 from __future__ import annotations
 
-import io
-import json
-import math
 import warnings
-import zipfile
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Final, TypedDict, Unpack
+from typing import Any, Final, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 from lensmodel.core.names import full_name
-from lensmodel.core.psf import EncodedPatch, PsfSample, centred
+from lensmodel.core.psf import PsfSample, centred
 from lensmodel.core.types import Channel, FieldPosition, LensSettings, field_grid
 from lensmodel.model import LensModel, PsfAnswer
-from lensmodel.model.identity import Camera, Identity
+from lensmodel.model.identity import Identity
+from lensmodel.model.profile import LensProfile, read_profile, write_profile
 from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
-
-_FORMAT: Final = 2  # raised when samples of before mean nothing to the model any more
-_MAX_BYTES: Final = 1 << 30  # unpacked: against files made to fill the memory
-_MAX_SAMPLES: Final = 200_000  # some 700 photos of 96 patches in three colours (chosen: memory)
-_MAX_SIDE: Final = (
-    255  # pixels: several times the widest kernels; larger files would fill the memory (chosen)
-)
-_KERNELS, _ENCODED = "kernels.npy", "encoded.npy"
-_INFINITY: Final = "infinity"  # a focus distance for which JSON has no number
 
 DEFAULT_SIZE: Final = 55  # pixels (chosen): side of a kernel that a correction uses, so that the same is seen
 
@@ -56,7 +34,7 @@ class Settings(TypedDict, total=False):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Lens:
+class Lens(LensProfile):
     """One copy of a lens: its PSF at every place of the picture, aperture and color.
 
     The PSF is the function f(u, v, r, phi, settings) of M. Hirsch and B. Schölkopf, "Self-Calibration of
@@ -67,11 +45,6 @@ class Lens:
 
     Lenses are values: nothing changes one. Make them with `calibrate`, `Lens.from_kernels` or `Lens.load`.
     """
-
-    model: LensModel  # the function behind the answers
-    names: Mapping[str, str] = field(default_factory=dict)  # what is known of maker, model, serial and label
-    photos: Mapping[str, str] = field(default_factory=dict)  # file names by the id that samples carry
-    cameras: tuple[Camera, ...] = ()  # what the photos were taken with, each once; empty where none says
 
     def __repr__(self) -> str:
         return f"<Lens: {self.description}, {len(self.samples)} samples>"
@@ -126,7 +99,8 @@ class Lens:
     @classmethod
     def load(cls, path: Path | str) -> Lens:
         """Open a lens profile that `save` or the command wrote; `InvalidInputError` if it is none."""
-        return read_profile(path, Path(path).name)
+        known = read_profile(path, Path(path).name)
+        return cls(known.model, known.names, known.photos, known.cameras)
 
     def save(self, path: Path | str) -> None:
         """Write the lens to a file, by custom `*.lensprofile`; it appears complete or not at all.
@@ -239,157 +213,3 @@ def _each(values: ArrayLike | Sequence[str] | None, n: int, name: str) -> list[A
         raise InvalidInputError(f"{name} must be one or {n}, one for each kernel, got {array.shape}")
     plain = array if array.dtype.kind == "U" else np.asarray(values, dtype=np.float64)
     return np.broadcast_to(plain, (n,)).tolist()
-
-
-# --- the profile ---------------------------------------------------------------------------------
-
-
-def write_profile(file: IO[bytes], lens: Lens) -> None:
-    """Write a lens to an open file."""
-    count, side = len(lens.samples), max(sample.kernel.shape[0] for sample in lens.samples)
-    if not _within_limits(count, side):
-        raise InvalidInputError(
-            f"a profile holds {_MAX_SAMPLES} samples of side {_MAX_SIDE}, not {count} of side {side}"
-        )
-    packed = pack_samples(lens.samples)
-    document = {
-        "format": _FORMAT,
-        "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
-        "lens": dict(lens.names),
-        "photos": dict(lens.photos),
-        "cameras": [{k: text for k, text in asdict(of).items() if text} for of in lens.cameras],
-        "model": {"mode": lens.model.mode},
-        "samples": packed.entries,
-    }
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("profile.json", json.dumps(document, allow_nan=False))
-        for name, array in ((_KERNELS, packed.kernels), (_ENCODED, packed.encoded)):
-            buffer = io.BytesIO()
-            np.save(buffer, array, allow_pickle=False)
-            archive.writestr(name, buffer.getvalue())
-        if _unpacked(archive) > _MAX_BYTES:
-            raise InvalidInputError(f"a profile holds {_MAX_BYTES >> 20} MiB at most; save fewer samples")
-
-
-def _within_limits(count: int, side: int) -> bool:
-    return 0 < count <= _MAX_SAMPLES and side <= _MAX_SIDE
-
-
-def _unpacked(archive: zipfile.ZipFile) -> int:
-    return sum(entry.file_size for entry in archive.infolist())
-
-
-def read_profile(source: Path | str | IO[bytes], name: str) -> Lens:
-    """Open a profile by its path or as an open file; errors call it `name`."""
-    try:
-        with zipfile.ZipFile(source) as archive:
-            return _read(archive, name)
-    except (FileNotFoundError, LensModelError):
-        raise
-    except Exception as error:  # zipfile, json and NumPy fail in a dozen ways on files made to do harm
-        raise InvalidInputError(f"{name} is no lens profile, or a damaged one; give another file") from error
-
-
-def _read(archive: zipfile.ZipFile, name: str) -> Lens:
-    if _unpacked(archive) > _MAX_BYTES:
-        raise InvalidInputError(f"{name} unpacks to more than {_MAX_BYTES >> 20} MiB; it is no lens profile")
-    document = json.loads(archive.read("profile.json"))
-    if document["format"] != _FORMAT:
-        raise InvalidInputError(
-            f"{name} has profile format {document['format']}, this program reads {_FORMAT}: its "
-            "samples are not those of this program; calibrate again with the photos of the lens"
-        )
-    stack, encoded = (
-        np.asarray(np.load(io.BytesIO(archive.read(part)), allow_pickle=False))
-        for part in (_KERNELS, _ENCODED)
-    )
-    entries = document["samples"]
-    fits = stack.ndim == 3 and len(entries) == len(stack) and _within_limits(*stack.shape[:2])
-    if not fits or stack.dtype != np.float32:
-        raise InvalidInputError(
-            f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
-            f"one is needed for each, of side {_MAX_SIDE} at most"
-        )
-    samples = unpack_samples(PackedSamples(entries, stack, encoded))
-    model = LensModel.fit(samples, document["model"].get("mode", "default"))
-    cameras = tuple(Camera(**_texts(camera)) for camera in document.get("cameras", []))
-    return Lens(model, _texts(document["lens"]), _texts(document["photos"]), cameras)
-
-
-def _texts(values: dict[str, Any]) -> dict[str, str]:
-    return {str(key)[:200]: str(value)[:200] for key, value in values.items()}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PackedSamples:
-    """Samples as JSON and arrays."""
-
-    # `entry_of` each sample, and in `encoded` the row of its patch, which its channels share, or None
-    entries: list[dict[str, Any]]
-    kernels: NDArray[np.float32]  # (n, k, k), zeros around kernels that are smaller than the largest
-    encoded: NDArray[np.uint8]  # (m, bytes), `EncodedPatch.to_bytes` of the patches
-
-
-def pack_samples(samples: Sequence[PsfSample]) -> PackedSamples:
-    """Turn samples into what `unpack_samples` reads."""
-    side = max(sample.kernel.shape[0] for sample in samples)
-    kernels = np.zeros((len(samples), side, side), dtype=np.float32)
-    patches: dict[bytes, int] = {}
-    entries = []
-    for number, sample in enumerate(samples):
-        kernels[number][_middle(side, sample.kernel.shape[0])] = sample.kernel
-        row = None if sample.encoded is None else patches.setdefault(sample.encoded.to_bytes(), len(patches))
-        entries.append({**entry_of(sample), "encoded": row})
-    rows = [np.frombuffer(data, dtype=np.uint8) for data in patches]
-    return PackedSamples(entries, kernels, np.stack(rows) if rows else np.empty((0, 0), dtype=np.uint8))
-
-
-def unpack_samples(packed: PackedSamples) -> list[PsfSample]:
-    """Build the samples that `pack_samples` was given."""
-    if packed.encoded.ndim != 2 or packed.encoded.dtype != np.uint8:
-        raise ValueError(f"encoded patches of shape {packed.encoded.shape}")
-    patches = [EncodedPatch.from_bytes(row.tobytes()) for row in packed.encoded]
-    side = packed.kernels.shape[1]
-    samples = []
-    for entry, kernel in zip(packed.entries, packed.kernels, strict=True):
-        row = entry["encoded"]
-        if not (row is None or (isinstance(row, int) and 0 <= row < len(patches))):
-            raise ValueError(f"no encoded patch {row!r}, there are {len(patches)}")
-        own = kernel[_middle(side, int(entry["size"]))]
-        samples.append(sample_of(entry, own, None if row is None else patches[row]))
-    return samples
-
-
-def _middle(side: int, size: int) -> tuple[slice, slice]:
-    """The middle `size` rows and columns of `side`."""
-    margin, odd = divmod(side - size, 2)
-    if not 0 < size <= side or odd:
-        raise ValueError(f"kernels of side {size} in an array of side {side}")
-    return slice(margin, margin + size), slice(margin, margin + size)
-
-
-# Fields of a sample that its entry holds as they are
-_NAMED_ALIKE: Final = ("weight", "photo", "pixel_pitch_um", "half_diagonal_px", "estimator", "error")
-
-
-def entry_of(sample: PsfSample) -> dict[str, Any]:
-    """Return the named fields of a sample: all of it but the kernel and the encoded patch."""
-    settings = asdict(sample.settings)
-    if settings["focus_m"] == math.inf:
-        settings["focus_m"] = _INFINITY
-    named = {name: getattr(sample, name) for name in _NAMED_ALIKE}
-    return {"size": sample.kernel.shape[0], **asdict(sample.position), "settings": settings, **named}
-
-
-def sample_of(
-    entry: Mapping[str, Any], kernel: NDArray[np.float32], encoded: EncodedPatch | None
-) -> PsfSample:
-    """Build the sample of which `entry_of` returned the fields."""
-    settings = dict(entry["settings"])
-    if settings.get("focus_m") == _INFINITY:
-        settings["focus_m"] = math.inf
-    place = FieldPosition(float(entry["r"]), float(entry["phi"]))
-    named = {name: entry[name] for name in _NAMED_ALIKE}
-    named |= {name: str(named[name]) for name in ("photo", "estimator")}
-    values = np.asarray(kernel, dtype=np.float64)
-    return PsfSample(values, place, LensSettings(**settings), encoded=encoded, **named)

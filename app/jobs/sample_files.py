@@ -19,7 +19,7 @@ from app.sandbox.child import MAX_RESULT
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import save_array
 from lensmodel.core.psf import PsfSample
-from lensmodel.lens import PackedSamples, pack_samples, unpack_samples
+from lensmodel.model.profile import PackedSamples, pack_samples, unpack_samples
 
 # Pixels across a returned kernel at most (chosen): as in a profile, docs/topics/profile-format.md
 MAX_SIDE: Final = 255

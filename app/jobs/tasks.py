@@ -38,8 +38,8 @@ from lensmodel.core.errors import ImageTooLargeError, LensModelError
 from lensmodel.core.files import from_json, to_json
 from lensmodel.core.names import camera_name
 from lensmodel.core.types import FieldPosition, LensSettings, Planes
-from lensmodel.lens import read_profile
 from lensmodel.model import LensModel
+from lensmodel.model.profile import read_profile
 from lensmodel.neural.network import FieldNetwork
 from lensmodel.patches import Patch
 from lensmodel.photo.lateral import LateralColour

@@ -23,7 +23,7 @@ from app.store.tables import LensRow
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.files import from_json, to_json
 from lensmodel.core.names import camera_name, full_name
-from lensmodel.lens import Lens, write_profile
+from lensmodel.model.profile import LensProfile, write_profile
 from lensmodel.report.export import to_csv
 from lensmodel.report.lens_report import LensReport, provenance
 
@@ -152,7 +152,7 @@ def get_lens_profile(lens_id: str, call: CallDep) -> Response:
     learned = {sample.photo for sample in model.samples}
     photos = {row.public_id: row.filename for row in rows if row.public_id in learned}
     out = io.BytesIO()
-    write_profile(out, Lens(model, lens.names, photos))
+    write_profile(out, LensProfile(model, lens.names, photos))
     name = lens.label or full_name(lens.maker, lens.model) or "lens"
     headers = common.file_headers(f"{name}.lensprofile")
     return Response(out.getvalue(), media_type="application/zip", headers=headers)

@@ -48,7 +48,7 @@ from app.store.tables import (
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.psf import EncodedPatch, PsfSample
-from lensmodel.lens import entry_of, sample_of
+from lensmodel.model.profile import entry_of, sample_of
 
 DTYPE: Final = "<f4"
 FORMAT_VERSION: Final = 2  # raised when samples of before mean nothing to the model any more

@@ -274,7 +274,7 @@ class SampleRow(Base):
     lens_id: Mapped[int | None] = mapped_column(ForeignKey("lens.id"))
     version_added: Mapped[int | None]
     channel: Mapped[str]
-    entry: Mapped[dict[str, Any]]  # what its photo's row does not know: fields of `lensmodel.lens`
+    entry: Mapped[dict[str, Any]]  # what its photo's row does not know: fields of `model.profile`
     format_version: Mapped[int]
     crc32: Mapped[Big]
     psf: Mapped[bytes] = mapped_column(deferred=True)

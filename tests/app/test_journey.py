@@ -24,7 +24,7 @@ from servers import free_port, ready
 import lensmodel
 from lensmodel.core.psf import rms_width
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
-from lensmodel.lens import read_profile
+from lensmodel.model.profile import read_profile
 
 SIGMA = 1.3
 

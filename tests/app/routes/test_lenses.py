@@ -24,9 +24,9 @@ from app.store import LensName, Store
 from app.store.tables import SampleRow
 from lensmodel.core.psf import centroid, rms_width
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.lens import Lens, read_profile, write_profile
 from lensmodel.model import LensModel
 from lensmodel.model.identity import Camera
+from lensmodel.model.profile import read_profile, write_profile
 from lensmodel.model.query import PAPER
 
 PLACE = "r=0.9&phi=0.59&aperture=1.4"
@@ -296,7 +296,7 @@ def profile(client: TestClient, learned: str) -> bytes:
 
 def changed(profile: bytes, **changes: Any) -> bytes:
     """Return a profile in which something else is written."""
-    known: Lens = read_profile(io.BytesIO(profile), "The answer")
+    known = read_profile(io.BytesIO(profile), "The answer")
     out = io.BytesIO()
     write_profile(out, replace(known, **changes))
     return out.getvalue()

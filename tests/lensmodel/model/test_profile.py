@@ -19,8 +19,9 @@ from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
-from lensmodel.lens import Lens, PackedSamples, pack_samples, unpack_samples
+from lensmodel.lens import Lens
 from lensmodel.model import LensModel
+from lensmodel.model.profile import PackedSamples, pack_samples, unpack_samples
 from lensmodel.model.query import PAPER
 
 SIZE = 21

@@ -33,7 +33,6 @@ _SHARPNESS: Final = LinearSegmentedColormap.from_list(
 _INKS: Final = ("#0b6e99", "#b45309", "#15803d", "#7e22ce")
 _CHART: Final = (7.0, 3.7)  # inches of a single chart (chosen: two side by side on a wide screen)
 _PAGE: Final = (8.27, 11.69)  # inches: A4
-_LETTERS_OF_A_LINE: Final = 1020.0  # over the size in points: of DejaVu Sans, narrower than the page (chosen)
 _A_PAGE: Final = 2  # panels below each other on a page: those of one aperture
 _HATCHED: Final[dict[str, Any]] = {"facecolor": "#f4f4f2", "edgecolor": "#a8a8a2", "hatch": "////", "lw": 0}
 _LUMA: Final = (0.2126, 0.7152, 0.0722)  # of red, green and blue (ITU-R BT.709)
@@ -115,8 +114,10 @@ def _pages(report: LensReport) -> list[Figure]:
     overview: list[Panel] = [(title, partial(_overview, found)), (points, partial(_points, found))]
     first = _page(report.name, overview, [2.6, 1.0], low=0.26, top=0.86)
     details = [f"{of}: {words}" for of, words in report.details.items()]
-    _written(first, 0.945, [report.verdict], 11.0)
-    _written(first, 0.25, [report.advice, EXPLAINED, report.facts, *details], 9.0)
+    _written(first, 0.945, [report.verdict], 11.0, 92)
+    _written(
+        first, 0.25, [report.advice, EXPLAINED, report.facts, *details], 8.5, 106
+    )  # names in capitals fit
     parts = [panels[k : k + _A_PAGE] for k in range(0, len(panels), _A_PAGE)]
     return [first, *(_page(report.name, part, [1.0] * _A_PAGE, low=0.02, top=0.93) for part in parts)]
 
@@ -151,14 +152,16 @@ def _page(name: str, panels: Sequence[Panel], heights: Sequence[float], *, low: 
     parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights)
     for place, panel in zip(parts, panels, strict=False):
         _draw(place, *panel)
-    _written(figure, 0.97, [name], 15.0, weight="bold")
+    _written(figure, 0.97, [name], 15.0, 68, "bold")
     return figure
 
 
-def _written(figure: Figure, top: float, lines: Iterable[str], size: float, **style: Any) -> None:  # noqa: ANN401
-    """Write paragraphs as wide as a page from a height on down."""
-    words = "\n".join(textwrap.fill(line, round(_LETTERS_OF_A_LINE / size)) for line in lines)
-    figure.text(0.07, top, words, fontsize=size, va="top", linespacing=1.3, **style)
+def _written(
+    figure: Figure, top: float, lines: Iterable[str], size: float, wide: int, weight: str = "normal"
+) -> None:
+    """Write paragraphs from a height on down, `wide` letters to the line."""
+    words = "\n".join(textwrap.fill(line, wide) for line in lines)
+    figure.text(0.07, top, words, fontsize=size, va="top", linespacing=1.3, weight=weight)
 
 
 # --- maps ---------------------------------------------------------------------------------------

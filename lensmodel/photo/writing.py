@@ -78,6 +78,10 @@ def write_image(
     if (encoding.opcodes_2 or encoding.opcodes_3) and format != "dng":
         said = "%s: what the DNG leaves to raw converters to correct is not in it; only DNG output keeps that"
         remarks_log.warning(said, path.name)
+    clipped = encoding.bit_depth == 32 and format not in {"tiff32", "dng"}
+    if clipped and (beyond := 100.0 * float((planes > 1.0).mean())):
+        said = "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them"
+        remarks_log.warning(said, path.name, beyond)
     linear = format == "tiff32" and color_space == "same" and encoding.transfer == "linear"
     target = _target(encoding, "camera-linear" if linear or format == "dng" else color_space)
     pixels = _encoded(planes, target, {"tiff32": None, "jpeg": 255, "png8": 255}.get(format, 65535))

@@ -231,21 +231,6 @@ def test_float_tiffs_are_linear_light(tmp_path: Path) -> None:
     assert developed.clip == (3.0, 3.0, 3.0)
 
 
-@pytest.mark.parametrize("profile", [False, True])
-def test_light_beyond_white_is_kept_in_a_float_tiff(tmp_path: Path, profile: bool) -> None:
-    pixels = np.stack([2.0 * textured(40, 60, k) for k in range(3)], axis=-1).astype(np.float32)
-    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    options = {"iccprofile": srgb} if profile else {}
-    developed = photo.develop(save(tmp_path, "tiff", pixels, photometric="rgb", **options))
-
-    photo.write_image(tmp_path / "out.tif", developed.planes, developed.encoding, format="tiff32")
-    kept = tifffile.imread(tmp_path / "out.tif")
-    again = photo.develop(tmp_path / "out.tif").planes
-
-    agree(kept, pixels, atol=1e-4)
-    agree(again, developed.planes, atol=1e-4)
-
-
 def test_only_the_first_picture_of_a_stereo_jpeg_is_the_photo(tmp_path: Path) -> None:
     left, right = (Image.new("RGB", (64, 48), grey) for grey in ("white", "black"))
     left.save(tmp_path / "x.jpg", "MPO", save_all=True, append_images=[right])
@@ -321,3 +306,23 @@ def test_the_greens_of_the_nikon_d1_clip_below_its_red(shared_data: Path) -> Non
 def test_a_raw_kind_that_libraw_lacks_is_refused_politely(shared_data: Path) -> None:
     with pytest.raises(UnsupportedFormatError, match="VC-5"):
         photo.inspect(shared_data / "raw" / "gopro_hero6_unsupported.gpr")
+
+
+@pytest.mark.parametrize("profile", [False, True])
+def test_light_beyond_white_is_kept_in_a_float_tiff_and_told_of_where_it_is_clipped(
+    tmp_path: Path, profile: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    pixels = np.stack([2.0 * textured(40, 60, k) for k in range(3)], axis=-1).astype(np.float32)
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    options = {"iccprofile": srgb} if profile else {}
+    developed = photo.develop(save(tmp_path, "tiff", pixels, photometric="rgb", **options))
+
+    photo.write_image(tmp_path / "out.tif", developed.planes, developed.encoding, format="tiff32")
+    kept = tifffile.imread(tmp_path / "out.tif")
+    again = photo.develop(tmp_path / "out.tif").planes
+    quiet = caplog.text
+    photo.write_image(tmp_path / "out.jpg", developed.planes, developed.encoding, format="jpeg")
+
+    agree(kept, pixels, atol=1e-4)
+    agree(again, developed.planes, atol=1e-4)
+    assert (quiet, f"{100 * (pixels > 1).mean():.1f} % of its samples" in caplog.text) == ("", True)

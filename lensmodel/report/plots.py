@@ -113,11 +113,10 @@ def _pages(report: LensReport) -> list[Figure]:
     points = "What becomes of a point of light in the centre and the corners"
     overview: list[Panel] = [(title, partial(_overview, found)), (points, partial(_points, found))]
     first = _page(report.name, overview, [2.6, 1.0], low=0.26, top=0.86)
-    details = [f"{of}: {words}" for of, words in report.details.items()]
+    notes = [report.advice, EXPLAINED, report.facts]
+    notes += [f"{of}: {words}" for of, words in report.details.items()]
     _written(first, 0.945, [report.verdict], 11.0, 92)
-    _written(
-        first, 0.25, [report.advice, EXPLAINED, report.facts, *details], 8.5, 106
-    )  # names in capitals fit
+    _written(first, 0.25, notes, 8.5, 106)  # file names in capitals fit too
     parts = [panels[k : k + _A_PAGE] for k in range(0, len(panels), _A_PAGE)]
     return [first, *(_page(report.name, part, [1.0] * _A_PAGE, low=0.02, top=0.93) for part in parts)]
 

@@ -19,7 +19,7 @@ from app.schemas import V1, CorrectionIn, CorrectionOut, Page, Region
 from app.store.lenses import LensState
 from app.store.photos import stored_settings
 from app.store.tables import LensRow, PhotoRow
-from lensmodel.core.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
+from lensmodel.core.errors import InvalidInputError, MetadataMissingError, NoSamplesError
 from lensmodel.correction import deconvolvers
 
 router = APIRouter(tags=["corrections"], route_class=OneSession)
@@ -40,7 +40,7 @@ def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
     """Correct a photo with the model of its lens, or of another; the same request is the same correction."""
     photo = call.photo(options.photo_id)
     if options.method not in deconvolvers:
-        raise UnknownMethodError(f"no method {options.method!r}; known: {', '.join(deconvolvers)}")
+        raise InvalidInputError(f"no method {options.method!r}; known: {', '.join(deconvolvers)}")
     _check_photo(photo, options.roi)
     lens = _lens_for(call, photo, options.lens_id)
     if not options.any_lens and lens.id != photo.lens_id:

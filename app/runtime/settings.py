@@ -15,7 +15,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_va
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from app.sandbox import account
-from lensmodel.core.errors import UnknownMethodError
+from lensmodel.core.errors import InvalidInputError
 
 PREFIX = "LENS_"
 CLIENT_KEY = "LENS_API_KEY"  # not a setting of the service: the key that its clients send
@@ -112,7 +112,7 @@ class Settings(BaseSettings):
 
             try:
                 estimators.create(self.estimator)
-            except UnknownMethodError as error:
+            except InvalidInputError as error:
                 raise ValueError(str(error)) from error
         if not self.database.startswith("sqlite") and not self.storage_url:
             raise ValueError(

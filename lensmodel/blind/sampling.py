@@ -75,7 +75,7 @@ def configured(
 ) -> Config:
     """Return a preset with what is asked for instead, before any work; None is as there."""
     if model not in PRESETS:
-        raise errors.UnknownMethodError(f"no model {model!r}; known: {', '.join(PRESETS)}")
+        raise errors.InvalidInputError(f"no model {model!r}; known: {', '.join(PRESETS)}")
     preset = PRESETS[model]
     asked = {"estimator": estimator, "kernel_size": kernel_size, "patches": patches}
     usual, method = (estimators.resolve(name) for name in (preset.estimator, estimator or preset.estimator))

@@ -22,10 +22,6 @@ class InvalidInputError(LensModelError):
     code: ClassVar[str] = "invalid_parameter"
 
 
-class UnknownMethodError(InvalidInputError):
-    """A name that is in no registry; the text lists the known ones."""
-
-
 class UnreadablePhotoError(LensModelError):
     """A file that cannot be decoded as a photo."""
 

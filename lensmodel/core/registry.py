@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 
-from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+from lensmodel.core.errors import InvalidInputError
 
 T = TypeVar("T")
 
@@ -20,7 +20,7 @@ class Registry(dict[str, Callable[..., T]]):
     def create(self, name: str, **params: object) -> T:
         """Build the entry called `name` from keyword parameters."""
         if name not in self:
-            raise UnknownMethodError(f"no {self.kind} {name!r}; known: {', '.join(self)}")
+            raise InvalidInputError(f"no {self.kind} {name!r}; known: {', '.join(self)}")
         return self[name](**params)
 
     def resolve(self, method: str | T) -> T:

@@ -1,7 +1,5 @@
 """PSFs measured on photos made for it, instead of estimated from ordinary ones: photos in, samples out."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from lensmodel.core.registry import Registry

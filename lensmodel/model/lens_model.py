@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
+from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone, zone_of
 from lensmodel.model import camera_bodies
@@ -38,7 +38,7 @@ class LensModel:
 
     def __init__(self, samples: tuple[PsfSample, ...], mode: str, before: Regression | None = None) -> None:
         if mode not in MODES:
-            raise UnknownMethodError(f"no mode {mode!r} of the lens model; choose one of {', '.join(MODES)}")
+            raise InvalidInputError(f"no mode {mode!r} of the lens model; choose one of {', '.join(MODES)}")
         if not samples:
             raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
         self.samples, self.mode = samples, mode

@@ -281,9 +281,8 @@ def lens_report(
     places = [*marked_places(aspect).items(), *(("", at) for at in grid(rows, cols, aspect))]
     numbers = _chosen(model) if apertures is None else apertures
     questions = [LensSettings(aperture=n) for n in numbers] or [LensSettings()]
-    pitch, half = (
-        _shared(getattr(s, n) for s in model.samples) for n in ("pixel_pitch_um", "half_diagonal_px")
-    )
+    known = ({getattr(s, n) for s in model.samples} for n in ("pixel_pitch_um", "half_diagonal_px"))
+    pitch, half = (values.pop() if len(values) == 1 else None for values in known)
     measured = all(sample.measured for sample in model.samples)
     tested = []
     for settings in questions:
@@ -442,11 +441,6 @@ def _chosen(model: LensModel) -> list[float]:
     known = sorted(set(numbers))
     inner = sorted(known[1:-1], key=lambda n: -numbers.count(n))[: _MOST_APERTURES - 2]
     return sorted({*known[:1], *known[-1:], *inner})
-
-
-def _shared(values: Iterable[float | None]) -> float | None:
-    known = set(values)
-    return next(iter(known)) if len(known) == 1 else None
 
 
 def filled_aspect(model: LensModel) -> float:

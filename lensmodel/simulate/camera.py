@@ -122,11 +122,10 @@ def photograph(
     frame = camera.frame
     clean = blurred(scene, lens, settings, frame, pitch_um=camera.pitch_um, size=size, step=step)
     clean = camera.balanced(clean * np.float32(exposure))
-    sharp = _with_margin(scene, frame, 0)
     return SimulatedPhoto(
         mosaic=camera.mosaic(clean, rng),
         clean=clean,
-        sharp=camera.balanced(sharp * np.float32(exposure)),
+        sharp=camera.balanced(_with_margin(scene, frame, 0) * np.float32(exposure)),
         lens=lens,
         camera=camera,
         settings=settings,
@@ -252,7 +251,6 @@ _BASE_ISO_ELECTRONS = 40000.0  # full well at ISO 100
 def write_photo(path: str | Path, photo: SimulatedPhoto) -> None:
     """Write the mosaic of a simulated photo as DNG."""
     camera, lens, settings = photo.camera, photo.lens, photo.settings
-    r, g, b = camera.white_balance
     metadata = PhotoMetadata(
         camera_maker=camera.maker,
         camera_model=camera.model,
@@ -273,6 +271,6 @@ def write_photo(path: str | Path, photo: SimulatedPhoto) -> None:
         pattern=camera.pattern,
         # scenes are linear sRGB, the sensor sees them unbalanced
         color_matrix=np.asarray(XYZ_TO_SRGB) / np.asarray(camera.white_balance)[:, None],
-        as_shot_neutral=(1.0 / r, 1.0 / g, 1.0 / b),
+        as_shot_neutral=[1.0 / multiplier for multiplier in camera.white_balance],
         metadata=metadata,
     )

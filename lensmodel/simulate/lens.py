@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import as_kernel, centroid
 from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.photo.values import LensIdentity
@@ -172,9 +172,7 @@ class SimulatedField:
         return _kernel(self.lens, position, self.settings.with_channel(channel), size)
 
 
-@lru_cache(maxsize=2048)  # 50 MB at most
-def _kernel(lens: SimulatedLens, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:
-    return lens.kernel(position, settings, size)
+_kernel = lru_cache(maxsize=2048)(SimulatedLens.kernel)  # 50 MB at most
 
 
 def coordinates(samples: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -425,7 +423,7 @@ def draw_lens(seed: int, kind: str | None = None) -> SimulatedLens:
     """Draw a copy of a lens, whose ray spot has a drawn r.m.s. width at the centre and one in the corner."""
     kind = LENS_KINDS[seed % len(LENS_KINDS)] if kind is None else kind
     if kind not in _KINDS:
-        raise UnknownMethodError(f"no kind of lens {kind!r}; known: {', '.join(LENS_KINDS)}")
+        raise InvalidInputError(f"no kind of lens {kind!r}; known: {', '.join(LENS_KINDS)}")
     rng = np.random.default_rng([seed, LENS_KINDS.index(kind)])
     f_numbers, *widths, unusual = _KINDS[kind]
     choices = _ZOOM_MM if kind == "zoom" else (_PRIME_MM,)

@@ -17,7 +17,7 @@ import lensmodel
 from lab.kernels import gaussian
 from lensmodel.api import say
 from lensmodel.core import processes
-from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, centroid
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings, field_grid
@@ -164,7 +164,7 @@ def test_what_would_be_lost_work_is_refused_before_it(lens: Lens) -> None:
 
     with pytest.raises(InvalidInputError, match=r"no format for out\.xyz"):
         lensmodel.correct(planes, lens, "out.xyz")
-    with pytest.raises(UnknownMethodError, match="standard"):
+    with pytest.raises(InvalidInputError, match="standard"):
         lensmodel.correct(planes, lens, method="nonsense")
     with pytest.raises(InvalidInputError, match="height, width"):
         lensmodel.correct(planes[0], lens)

@@ -21,7 +21,7 @@ from lab.outside import judged
 from lab.stored import ROOT
 from lensmodel.blind import PsfEstimate
 from lensmodel.core import psf
-from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError, UnknownMethodError
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, Plane
 from lensmodel.patches import Patch
@@ -203,7 +203,7 @@ def test_observation_is_the_scene_through_the_psf() -> None:
 def test_bad_settings_are_named(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="noise"):
         BlindBenchmark(noise=(0.0,))
-    with pytest.raises(UnknownMethodError, match="default"):
+    with pytest.raises(InvalidInputError, match="default"):
         run_blind_benchmark(BlindBenchmark(methods=("best",)))
     with pytest.raises(InvalidInputError, match="no PNG"):
         list_photos(tmp_path)

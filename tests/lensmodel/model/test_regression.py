@@ -12,7 +12,7 @@ import pytest
 
 from lab.kernels import distance, gaussian
 from lab.model_benchmark import pixel_to_local, run_model_benchmark
-from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
+from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.core.psf import PsfSample, centroid, delta, second_moments
 from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, regression
@@ -406,7 +406,7 @@ def test_no_samples_are_said_as_such() -> None:
 
 
 def test_a_mode_that_there_is_not_is_refused() -> None:
-    with pytest.raises(UnknownMethodError, match="paper"):
+    with pytest.raises(InvalidInputError, match="paper"):
         LensModel.fit(photos(1), "magic")
 
 

@@ -41,7 +41,7 @@ _PROCESSED: Final = 16.0  # noise variance of a photo without its mosaic over wh
 _USUAL_GRAIN, _COARSEST = 14.0, 4.0
 # Noise power of demosaiced planes at low frequencies over that of the sensor: see `development._NOISE_MIX`.
 _DEMOSAICED: Final = (3.7, 1.9, 3.7)
-_COARSEST_POWER: Final = 64.0  # largest `sensor.graininess` believed: cameras reach 60, texture far more
+_COARSEST_POWER: Final = 64.0  # largest `noise.graininess` believed: cameras reach 60, texture far more
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ class LinearPhoto:
         Which pixels of each plane were measured, and not filled in by demosaicing. `None` where
         the planes are no longer on the sensor's grid, or there was no Bayer mosaic.
     grain, chroma_step : tuple of three float, tuple of two int
-        How much coarser than white the noise of each plane is (`sensor.graininess`); rows and columns of
+        How much coarser than white the noise of each plane is (`noise.graininess`); rows and columns of
         pixels that share one value of chroma: (2, 2) in most JPEGs.
     remarks : tuple of str
         What was left out of the file or replaced in it, each a clause about "it".

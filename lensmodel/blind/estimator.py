@@ -109,7 +109,7 @@ def require_size(size: int) -> None:
 def usable(
     patches: Sequence[Plane], noise: Sequence[NoiseModel], size: int
 ) -> list[tuple[Plane, NoiseModel]]:
-    """Check patches at the door and keep those that carry signal."""
+    """Check patches first and keep those that carry signal."""
     require_size(size)
     if len(patches) != len(noise) or not patches:
         raise InvalidInputError(f"every patch needs a noise model, got {len(patches)} and {len(noise)}")

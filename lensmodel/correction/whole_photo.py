@@ -1,4 +1,4 @@
-"""Correct a whole photo in cells of one PSF each, faded into each other."""
+"""Correct a whole photo in cells of one PSF each, faded into each other: efficient filter flow."""
 
 from __future__ import annotations
 

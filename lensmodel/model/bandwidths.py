@@ -6,7 +6,7 @@ held-out samples follows from the Gram matrix G = C C' alone, and trying another
 
     |C_i - f_i|^2 = G_ii - 2 (W G)_ii + (W G W')_ii
 
-A spoilt photo (defocus, shake, another lens) spoils all its samples, so photos are judged first, by the
+An outlying photo (defocus, shake, another lens) spoils all its samples, so photos are judged first, by the
 median of their held-out errors d_i, then samples, by Tukey's biweight; one that fits better than the median
 keeps its weight::
 
@@ -45,7 +45,7 @@ _FEWEST = 2  # one sample cannot be left out
 _TUKEY = 4.685  # 95 % efficiency for normal errors (P. J. Huber, "Robust Statistics", 1981: Tukey's biweight)
 _ROUNDS = 4  # of reweighting: each costs as much, and later ones change the weights less (chosen)
 _MIN_PHOTOS = 3  # with two nobody knows which one is wrong
-_SPOILT = 0.5  # factor below which a photo is spoilt: it counts for less than half of its claim (chosen)
+_OUTLYING = 0.5  # factor below which a photo is an outlier: it has less than half of its weight (chosen)
 
 
 def reference_bandwidth(sigma: float, dimensions: int, count: int) -> float:
@@ -76,24 +76,24 @@ class HeldOut:
     """Samples prepared for cross-validation: what those of other groups say of each.
 
     `rows` (n, m) are kernels as flat rows of a square grid, at points `where` (n, 7); `scale` are bandwidths,
-    `claims` (n,) the weights of the samples; those of one of `groups` (n,) are held out together.
+    `prior` (n,) the weights of the samples as they come; those of one of `groups` (n,) are held out together.
     """
 
     def __init__(
-        self, rows: NDArray[np.floating], where: Array, scale: Array, claims: Array, groups: NDArray[np.intp]
+        self, rows: NDArray[np.floating], where: Array, scale: Array, prior: Array, groups: NDArray[np.intp]
     ) -> None:
         rows = np.asarray(rows, dtype=np.float64)  # errors are small differences of these products
         gap = np.nan_to_num((where[:, None, :] - where[None, :, :]) / scale, nan=0.0) ** 2
-        self.claims, self._gram = claims, rows @ rows.T
+        self.prior, self._gram = prior, rows @ rows.T
         self._own = np.maximum(np.diag(self._gram), 1e-30)
         self._place, self._turn = gap[..., 0], gap[..., 1] + gap[..., 2]
         self._others = np.where(groups[:, None] == groups[None, :], np.inf, gap[..., 3:].sum(axis=-1))
 
-    def weights(self, factors: tuple[float, float], trust: Array | float = 1.0) -> Array:
+    def weights(self, factors: tuple[float, float], robust: Array | float = 1.0) -> Array:
         """Held-out Nadaraya-Watson weights at multiples of the bandwidths in r and phi, rows of sum 1."""
         squared = self._place / factors[0] ** 2 + self._turn / factors[1] ** 2 + self._others
         nearest = squared.min(axis=1, keepdims=True)
-        weight = self.claims * np.exp(-0.5 * (squared - np.where(np.isfinite(nearest), nearest, 0.0))) * trust
+        weight = self.prior * np.exp(-0.5 * (squared - np.where(np.isfinite(nearest), nearest, 0.0))) * robust
         total = weight.sum(axis=1, keepdims=True)
         return np.asarray(weight / np.where(total > 0, total, 1.0))
 
@@ -117,8 +117,8 @@ class HeldOut:
 
         def best(options: list[tuple[float, float]]) -> tuple[float, float]:
             errors = [np.minimum(self.errors(self.weights(option)), _CAP) for option in options]
-            scores = np.average(errors, axis=1, weights=np.maximum(self.claims, 1e-9))
-            # the least reach among those that are as good: far neighbours cost time and trust in a symmetry
+            scores = np.average(errors, axis=1, weights=np.maximum(self.prior, 1e-9))
+            # the least reach among those that are as good: far neighbours cost time and assume a symmetry
             return options[int((scores <= scores.min() * _AS_GOOD + _NEGLIGIBLE).argmax())]
 
         r, phi = 1.0, 1.0
@@ -139,7 +139,7 @@ class HeldOut:
             errors = self.errors(self.weights(factors, by_sample * by_photo[photos]))
             medians = np.array([np.median(errors[photos == p]) for p in range(count)])
             by_photo = _biweight(medians, medians, floor=0.25)
-            by_sample = _biweight(errors, errors[by_photo[photos] > _SPOILT], floor=0.35)
+            by_sample = _biweight(errors, errors[by_photo[photos] > _OUTLYING], floor=0.35)
         return by_sample, by_photo, errors
 
 
@@ -173,14 +173,14 @@ def cross_validate(
     if len(scored) < _FEWEST:
         return weights, errors, noise, (1.0, 1.0)
 
-    def held(rows: NDArray[np.intp], claims: Array) -> HeldOut:
-        return HeldOut(upright(rows).reshape(len(rows), -1), where[rows], scale, claims[rows], groups[rows])
+    def held(rows: NDArray[np.intp], prior: Array) -> HeldOut:
+        return HeldOut(upright(rows).reshape(len(rows), -1), where[rows], scale, prior[rows], groups[rows])
 
-    def searched(claims: Array) -> tuple[float, float]:
+    def searched(prior: Array) -> tuple[float, float]:
         if mode == PAPER or len(np.unique(photo[counting])) < _CV_PHOTOS:
             return 1.0, 1.0
         green = counting[where[counting, 4] == WAVELENGTH_NM["g"]]  # it has the least noise
-        return held(thinned(green if green.size else counting, _CV_SAMPLES), claims).best_factors()
+        return held(thinned(green if green.size else counting, _CV_SAMPLES), prior).best_factors()
 
     factors, prepared = searched(base), held(scored, base)
     known, own_photo = np.unique(photo[scored], return_inverse=True)
@@ -190,7 +190,7 @@ def cross_validate(
         of_photos[known] = by_photo
         weights *= of_photos[photo]
         weights[scored] *= by_sample
-        if min(by_photo.min(), by_sample.min()) < _SPOILT:  # spoilt ones chose as well
+        if min(by_photo.min(), by_sample.min()) < _OUTLYING:  # outliers chose as well
             factors = searched(weights)
     scatter = np.minimum(prepared.noise(prepared.weights(factors)), held_out**2)
     errors[:], noise[:] = float(np.median(held_out)), float(np.median(scatter))

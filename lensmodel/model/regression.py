@@ -228,13 +228,13 @@ class WidthField:
         weight = np.maximum(weights[rows], 1e-3)
         extra = design.shape[1] - len(_PLACE_RIDGE)
         ridge = np.diag(np.concatenate([_PLACE_RIDGE, np.full(extra, _SETTING_RIDGE)])) * weight.mean()
-        trust = np.ones(len(samples))
+        robust = np.ones(len(samples))
         slopes = np.zeros((design.shape[1], 2))
         for _ in range(_ROUNDS):
-            weighted = design * (weight * trust)[:, None]
+            weighted = design * (weight * robust)[:, None]
             slopes = np.linalg.solve(design.T @ weighted + ridge, weighted.T @ target)
             miss = np.abs(target - design @ slopes).max(axis=1)
-            trust = np.minimum(1.0, _HUBER / np.maximum(miss, 1e-12))
+            robust = np.minimum(1.0, _HUBER / np.maximum(miss, 1e-12))
         seen = design @ slopes
         reference = float((seen.min() + seen.max()) / 2.0)  # as far from the narrowest as from the widest
         return cls(slopes, reference, stops, focal)

@@ -130,11 +130,11 @@ def _line(
     # ever adds, so points above the line lose weight, those below do not. `chance` is three standard errors
     # of a variance from the median deviation of pixels, every second independent after the high-pass.
     chance = 3.0 * np.sqrt(2.7 * 2.0 * 2.0 / counts)
-    trust, model = np.ones_like(levels), np.maximum(variances, 1e-16)
+    robust, model = np.ones_like(levels), np.maximum(variances, 1e-16)
     slope = offset = 0.0
     for _ in range(12):
-        weight = np.sqrt(counts * trust) / np.maximum(model, 1e-16)
+        weight = np.sqrt(counts * robust) / np.maximum(model, 1e-16)
         slope, offset = optimize.nnls(np.stack([levels * weight, weight], axis=1), variances * weight)[0]
         model = np.maximum(slope * levels + offset, 1e-16)
-        trust = np.minimum(1.0, chance / np.maximum((variances - model) / model, chance)) ** 2
+        robust = np.minimum(1.0, chance / np.maximum((variances - model) / model, chance)) ** 2
     return float(slope), float(offset)

@@ -330,7 +330,7 @@ def test_one_bad_photo_moves_the_field_by_less_than_a_sixth_of_a_plain_mean(nois
 
 def test_bandwidths_are_searched_again_without_a_spoilt_photo(monkeypatch: pytest.MonkeyPatch) -> None:
     claims = []
-    monkeypatch.setattr(HeldOut, "best_factors", lambda held: claims.append(held.claims) or (1.0, 1.0))
+    monkeypatch.setattr(HeldOut, "best_factors", lambda held: claims.append(held.prior) or (1.0, 1.0))
 
     LensModel.fit([*photos(9, noise=0.01, samples=16), *photo("shaken", 50, blur=16.0, count=16)])
 

@@ -132,7 +132,9 @@ def run(
     from app.main import create_app  # noqa: PLC0415 - a worker need not load the application
 
     async def watch() -> None:
-        server.should_exit |= until is not None and until.poll() is not None
+        # not `|=`, which would undo what a signal says while the worker is asked
+        if until is not None and until.poll() is not None:
+            server.should_exit = True
 
     server = _Announced(
         uvicorn.Config(

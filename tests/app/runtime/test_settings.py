@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import signal
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ import pytest
 import yaml  # type: ignore[import-untyped]  # its types are a package of their own
 
 from app.runtime.settings import PREFIX, Settings, described
-from app.runtime.supervisor import listen
+from app.runtime.supervisor import listen, run
 from lensmodel.core.errors import InvalidInputError
 
 ROOT = Path(__file__).parents[3]
@@ -100,3 +102,25 @@ def test_an_unknown_estimator_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match=r"no estimator 'nothing'; known: .*michaeli-irani"):
         Settings(estimator="nothing")
     assert Settings(estimator="michaeli-irani").estimator == "michaeli-irani"
+
+
+class Asked:
+    """A worker that lives; the order to stop comes just when it is asked."""
+
+    def __init__(self) -> None:
+        self.times = 0
+
+    def poll(self) -> None:
+        self.times += 1
+        if self.times == 1:
+            signal.raise_signal(signal.SIGINT)
+        elif self.times > 5:  # the order was lost
+            pytest.fail("the service goes on")
+
+
+def test_an_order_to_stop_is_not_lost_while_the_worker_is_asked(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.runtime.logs.begin", lambda *_: None)  # of this process
+    with closing(listen("127.0.0.1", 0)) as listener, pytest.raises(KeyboardInterrupt):
+        run(settings, listener, until=Asked())  # type: ignore[arg-type]

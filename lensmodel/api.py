@@ -344,9 +344,9 @@ def correct(
     ------
     OSError, UnreadablePhotoError, ImageTooLargeError
         If a file cannot be read or written, not be decoded, or has more pixels than are read.
-    InvalidInputError
+    InvalidInputError, OutsideSupportError
         If a value is out of its range, the ending of `output` is unknown, it is the photo itself, or no
-        method has that name.
+        method has that name; if nothing tells which part of what the lens draws the photo shows.
     """
     _require_workers(workers)
     given = LensSettings(aperture, focal_mm, focus_m)

@@ -44,6 +44,7 @@ class Lens(LensProfile):
     sensor that the lens was calibrated on.
 
     Lenses are values: nothing changes one. Make them with `calibrate`, `Lens.from_kernels` or `Lens.load`.
+    Places and settings out of their range raise `InvalidInputError`.
     """
 
     def __repr__(self) -> str:

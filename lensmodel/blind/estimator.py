@@ -63,8 +63,8 @@ class PsfEstimator(Protocol):
 
         Parameters
         ----------
-        patches : sequence of Plane, float32, each of shape (h, w)
-            Windows of 64 to 512 px of one color plane, linear light; `noise` has a model for each.
+        patches, noise : sequence of Plane, float32, each of shape (h, w), and of NoiseModel
+            Windows of 64 to 512 px of one color plane, linear light, and a model for each.
         size : int
             Odd side of the kernel, up to 55.
         green : PsfEstimate, optional
@@ -72,8 +72,8 @@ class PsfEstimator(Protocol):
 
         Raises
         ------
-        NotEnoughEvidenceError
-            If no patch determines a kernel: flat, clipped, or noise only.
+        InvalidInputError, NotEnoughEvidenceError
+            If patches are no such windows; if none determines a kernel: flat, clipped, or noise only.
         """
 
 

@@ -230,7 +230,7 @@ class CalibrationEvent:
     stage : {"developing", "selecting", "estimating", "counted", "skipped"}
         The last two end the work on a photo.
     done, total : int
-        Patches, while estimating; else 0.
+        Patches, while estimating; samples, where counted; else 0.
     detail, error : str, Exception or None
         Why a photo was skipped, and what was raised; nothing where the lens knows it already.
     """

@@ -190,7 +190,7 @@ class UniformBlur:
         return self._spectra[shape]
 
     def forward(self, latent: Plane) -> Plane:
-        """K * x where every pixel of the kernel meets data: `(h + k - 1, ...)` to `(h, ...)`, float32."""
+        """K * x where every pixel of the kernel meets data: `(h + 2 reach, ...)` to `(h, ...)`, float32."""
         cut, (height, width) = self.reach, latent.shape
         if min(latent.shape) <= 2 * cut:
             raise InvalidInputError(
@@ -199,7 +199,7 @@ class UniformBlur:
         return self._applied(latent, (height, width), FORWARD, 0, cut)
 
     def adjoint(self, blurred: Plane) -> Plane:
-        """Correlation of y with k on the latent plane: `(h, ...)` to `(h + k - 1, ...)`, float32."""
+        """Correlation of y with k on the latent plane: `(h, ...)` to `(h + 2 reach, ...)`, float32."""
         cut, (height, width) = self.reach, blurred.shape
         return self._applied(blurred, (height + 2 * cut, width + 2 * cut), BACK, cut, 0)
 

@@ -148,7 +148,7 @@ class LinearPhoto:
         Black 0, saturation 1, not white balanced; RAW stays in the camera's own colors.
     frame, info, encoding : Frame, PhotoInfo, Encoding
         Size of the planes; what the file says; the way back to a file.
-    noise, sensor_noise, coding_noise : NoiseModel
+    noise, sensor_noise, coding_noise : tuple of three NoiseModel, the same or None, NoiseModel or None
         Variance of the pixels of each plane; where there is a mosaic, that of the sensor itself in each
         colour: white, unlike that of demosaiced planes; what lossy compression adds where there is detail.
     clip : tuple of three float

@@ -122,5 +122,9 @@ def test_an_order_to_stop_is_not_lost_while_the_worker_is_asked(
     settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("app.runtime.logs.begin", lambda *_: None)  # of this process
-    with closing(listen("127.0.0.1", 0)) as listener, pytest.raises(KeyboardInterrupt):
-        run(settings, listener, until=Asked())  # type: ignore[arg-type]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # commands set one of their own
+    try:
+        with closing(listen("127.0.0.1", 0)) as listener, pytest.raises(KeyboardInterrupt):
+            run(settings, listener, until=Asked())  # type: ignore[arg-type]
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -253,10 +253,10 @@ def _log_widths(sample: PsfSample) -> tuple[float, float]:
 _FINER = 2  # coefficients for each pixel along an axis (chosen); 1 where memory is short
 _MOST_BYTES = 1 << 29  # beyond, kernels are kept no finer than their pixels
 
-# Degree of the spline that fills the finer grid, and of that of kernels with more contrast at the Nyquist
-# frequency (chosen): turned by 45 degrees, a Gaussian of .8 px would be off by 3 % with a cubic one, by .6 %
-# with this, and one below .65 px ripples with more than a cubic one
-_DEGREE, _DEGREE_OF_SHARP, _SHARP = 5, 3, 0.12
+# Degrees of the spline that fills the finer grid (chosen): a cubic one would be off by .7 % of the peak of a
+# Gaussian of 1.1 px turned by 45 degrees; kernels up to the Nyquist frequency ripple with a high one
+_SMOOTH, _NARROW = 7, 3
+_ALIASED = (0.05, 0.2)  # contrast at the Nyquist frequency: below, above
 _MARGIN = 8  # pixels: the spline's response has fallen to 3e-5 there
 _RIM = 3  # coefficients around the grid, zeros: so far out a spline is not zero yet
 _LIGHT = 1e-6  # of the peak: fainter pixels do not widen the spline
@@ -366,8 +366,13 @@ def coefficients(kernel: NDArray[np.floating], finer: int) -> Array:
     """Coefficients of the spline through the pixels of a kernel, `(k, k)` to `(finer (k - 1) + 1,) * 2`."""
     turns = 1.0 - 2.0 * (np.arange(kernel.shape[0]) % 2)
     contrast = max(abs(float(turns @ kernel.sum(axis=axis))) for axis in (0, 1)) / float(kernel.sum())
-    refining = _refining(kernel.shape[0], _DEGREE_OF_SHARP if contrast > _SHARP else _DEGREE, finer)
-    return np.asarray(refining @ kernel @ refining.T)
+    narrow = float(np.interp(contrast, _ALIASED, (0.0, 1.0)))
+    spline = np.zeros(())
+    for share, degree in ((1.0 - narrow, _SMOOTH), (narrow, _NARROW)):
+        if share > 0.0:
+            refining = _refining(kernel.shape[0], degree, finer)
+            spline = spline + share * (refining @ kernel @ refining.T)
+    return np.asarray(spline)
 
 
 @lru_cache(maxsize=16)

@@ -315,9 +315,8 @@ def test_many_large_kernels_are_kept_no_finer_than_their_pixels(monkeypatch: pyt
 # ---- bad photos, and what it says of itself
 
 
-@pytest.mark.parametrize("noise", [0.01, 0.03, 0.1])
-def test_one_bad_photo_moves_the_field_by_less_than_a_sixth_of_a_plain_mean(noise: float) -> None:
-    clean, bad = photos(9, noise=noise, samples=16), photo("shaken", 50, blur=16.0, count=16)
+def test_one_bad_photo_moves_the_field_by_less_than_a_tenth_of_a_plain_mean() -> None:
+    clean, bad = photos(9, noise=0.01, samples=16), photo("shaken", 50, blur=16.0, count=16)
 
     def moved(mode: str) -> float:
         before, after = (LensModel.fit(samples, mode) for samples in (clean, [*clean, *bad]))
@@ -325,7 +324,7 @@ def test_one_bad_photo_moves_the_field_by_less_than_a_sixth_of_a_plain_mean(nois
         gaps = before.kernels(asked, GREEN, SIZE) - after.kernels(asked, GREEN, SIZE)
         return float(np.linalg.norm(gaps, axis=(1, 2)).mean())
 
-    assert moved("default") < moved("paper") / 6.0
+    assert moved("default") < 0.1 * moved("paper")
 
 
 def test_bandwidths_are_searched_again_without_a_spoilt_photo(monkeypatch: pytest.MonkeyPatch) -> None:

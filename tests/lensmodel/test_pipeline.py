@@ -86,7 +86,7 @@ def test_lateral_colour_does_not_hang_on_the_level_of_white(city: LinearPhoto) -
 
 def test_cells_hold_every_patch_once_largest_first() -> None:
     place = FieldPosition(0.1, 0.0)
-    patches = tuple(Patch(i, i, 64, place, 1.0, cell) for i, cell in enumerate((0, 1, 1, 2, 2, 2)))
+    patches = tuple(Patch(i, i, 64, place, 1.0, cell) for i, cell in enumerate((2, 1, 2, 0, 2, 1)))
 
     groups = sampling.patches_by_cell(Selection(patches, ()))
 

@@ -17,7 +17,7 @@ EOS = Camera("Canon", "Canon EOS 5D", "0123")
 OTHER_EOS = Camera("Canon", "Canon EOS 5D", "77")
 COMPACT = Camera("EASTMAN KODAK COMPANY", "KODAK Z612 ZOOM DIGITAL CAMERA", None)
 KODAK = Camera(None, "Kodak Z612")
-IPHONE_A, IPHONE_B = Camera("Apple", "iPhone 6", "A1"), Camera("Apple", "iPhone 6", "B2")
+IPHONE, IPHONE_A, IPHONE_B = (Camera("Apple", "iPhone 6", serial) for serial in (None, "A", "B"))
 
 SAYS_NOTHING, EF35_ON_EOS = Identity(), Identity({"model": "EF35mm f/2"}, [EOS])
 CANON_ON_EOS, OF_EOS, OF_COMPACT = Identity(CANON, [EOS]), Identity({}, [EOS]), Identity({}, [COMPACT])
@@ -39,7 +39,7 @@ def test_a_lens_is_known_however_a_program_writes_its_name() -> None:
         (Identity(CANON), OF_COMPACT),  # a profile need not say its camera
         (CANON_ON_EOS, SAYS_NOTHING),  # as a scan
         (Identity(LABELLED, [EOS]), Identity({"model": "50mm"}, [EOS])),
-        (Identity(PHONE, [IPHONE_A]), Identity(PHONE, [IPHONE_A])),
+        (Identity(PHONE, [IPHONE]), Identity(PHONE, [IPHONE_A])),
         (Identity({}, [KODAK], [5.85]), Identity({}, [KODAK], [23.4])),  # a compact that zooms
         (Identity(ACME, [EOS], [42.0]), Identity({"model": "acme-42mm"}, [COMPACT], [42.0])),
         (Identity(CANON, [EOS], [24.0]), Identity(CANON, [EOS], [70.0])),  # a zoom that names itself

@@ -11,7 +11,6 @@ from datetime import datetime, timedelta
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import pytest
 from in_process import lensmodel
@@ -19,7 +18,7 @@ from PIL import Image
 from running import SMALL, lens_of_one_blur, write_photo
 
 from lensmodel.blind.sampling import photo_id
-from lensmodel.cli.console import Bar
+from lensmodel.cli import console
 from lensmodel.cli.correct import Shot, groups
 from lensmodel.lens import Lens
 from lensmodel.model.identity import Camera
@@ -273,12 +272,10 @@ def test_all_lenses_are_learned_before_photos_are_corrected(
 ) -> None:
     shutil.copytree(card / "holiday", tmp_path / "holiday", ignore=shutil.ignore_patterns("corrected"))
     shutil.copytree(card / "lenses", tmp_path / "lenses")
-    shown: list[str] = []
+    monkeypatch.setattr(console, "EVERY_S", 0.0)
 
-    def show(self: Bar, completed: float = 0.0, **changes: Any) -> None:
-        shown.append(str(changes.get("description") or "").partition(" ")[0])
+    lines = re.findall(r"\] +(\d+) % (\w+)", lensmodel(*AUTO, cwd=tmp_path).stderr)
 
-    monkeypatch.setattr(Bar, "show", show)
-    lensmodel(*AUTO, cwd=tmp_path)
-
-    assert [verb for verb, _ in groupby(filter(None, shown))] == ["learning", "correcting"]
+    parts = [(verb, [int(share) for share, _ in part]) for verb, part in groupby(lines, lambda line: line[1])]
+    assert [verb for verb, _ in parts] == ["learning", "correcting"]
+    assert parts[-1][1][-1] == 100

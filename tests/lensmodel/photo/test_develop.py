@@ -193,8 +193,8 @@ def test_raw_data_that_are_no_picture_are_refused(
 @pytest.mark.parametrize("kind", ["tiff", "png"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_srgb_is_decoded_in_full_precision_grey_to_three_planes_and_alpha_dropped(
-    tmp_path: Path, kind: str, dtype: type, channels: int
+def test_srgb_is_decoded_in_full_precision_grey_to_three_planes_and_alpha_dropped_with_a_word(
+    tmp_path: Path, kind: str, dtype: type, channels: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     top = np.iinfo(dtype).max
     pixels = np.rint(np.stack([textured(40, 60, k) for k in range(channels)], axis=-1) * top).astype(dtype)
@@ -207,6 +207,17 @@ def test_srgb_is_decoded_in_full_precision_grey_to_three_planes_and_alpha_droppe
     assert developed.encoding.bit_depth == 8 * np.dtype(dtype).itemsize
     assert developed.clip == (1.0, 1.0, 1.0)
     assert developed.remarks == (("its transparency is dropped",) if channels == 4 else ())
+    assert (f"x.{kind}: its transparency" in caplog.text) == (channels == 4)
+
+
+@pytest.mark.parametrize("mode", ["P", "RGB", "L", "opaque"])
+def test_transparency_said_in_other_ways_is_told_too(tmp_path: Path, mode: str) -> None:
+    image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8))
+    image = image.convert("RGBA" if mode == "opaque" else mode)
+    clear = {} if mode == "opaque" else {"transparency": image.getpixel((5, 5))}
+    image.save(tmp_path / "x.png", **clear)
+
+    assert bool(photo.develop(tmp_path / "x.png").remarks) == (mode != "opaque")
 
 
 @pytest.mark.parametrize("compression", [None, "lzw", "zlib"])

@@ -33,7 +33,7 @@ def calibrate(
     ] = None,
     kernel_size: Annotated[
         int | None,
-        typer.Option(help="Side of the kernels, odd, 3 to 55; default: 31, with --model paper 55."),
+        typer.Option(help="Side of the kernels, odd, 3 to 55; default: 55, of an estimator of one place 31."),
     ] = None,
     selector: Annotated[str, typer.Option(help=f"Of patches: {', '.join(selectors)}.")] = "r-map",
     workers: console.Workers = None,

@@ -126,5 +126,6 @@ def export(
         with files.as_usage():
             settings = widest(model) if aperture is None else LensSettings(aperture=aperture)
         psfs = psf_grid(model, settings.with_channel(channel), rows=rows, cols=cols, size=size)
+    output.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(output, EXPORTERS[file_format](psfs))
     shown.result(str(output))

@@ -10,7 +10,7 @@ import numpy as np
 
 from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, Plane, Planes
-from lensmodel.correction.blur import ONE, ZERO, Real, UniformBlur, block_sums, interpolated, smooth
+from lensmodel.correction.blur import ONE, ZERO, Real, UniformBlur, Window, block_sums, interpolated, smooth
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.richardson_lucy import LEAST_CLIPPED
 
@@ -40,7 +40,7 @@ _FOOT: Final = np.array([0.16, 0.5, 0.84, 1, 1, 1, 0.84, 0.5, 0.16], dtype=np.fl
 
 @dataclass(frozen=True, slots=True)
 class Audit:
-    """Mean share of a correction that was held back, 0 to 1, and that of each check as if alone."""
+    """Mean share of a correction that was held back, 0 to 1, and of each check alone; of pixels their sum."""
 
     held_back: float = 0.0
     checks: Mapping[str, float] = field(default_factory=dict)
@@ -63,7 +63,7 @@ def held_back(
     blurs: Sequence[UniformBlur] | None,
     sensors: Sequence[Sensor],
     errors: Sequence[float],
-    inner: tuple[slice, slice],
+    inner: Window,
 ) -> tuple[Planes, Plane, Audit]:
     r"""Mix the `inner` part of a tile's correction back towards the photo as far as it fails an audit.
 

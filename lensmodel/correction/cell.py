@@ -6,12 +6,14 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import PsfField, as_kernel, crop_to_support, delta
 from lensmodel.core.types import (
     CHANNELS,
     BayerPattern,
@@ -27,10 +29,43 @@ from lensmodel.correction.blur import Drift, Real, UniformBlur, Window, fitted_h
 from lensmodel.correction.deconvolver import Deconvolver, Sensor, Solution, restore_planes
 from lensmodel.correction.expected_gain import WORTH_DB, CellForecast, plan
 from lensmodel.correction.limit import Bounds, StoredColour, limited
-from lensmodel.correction.posterior import PsfPosterior
+from lensmodel.correction.posterior import PosteriorField, PsfPosterior
+from lensmodel.photo.lateral import LateralColour
+
+KERNEL_SIZE: Final = 55  # pixels: the largest kernel that the paper estimates
+_KEPT: Final = 640  # kernels to keep: three rows of cells of 100 megapixels
 
 PosteriorAt = Callable[[FieldPosition, Channel], PsfPosterior]
 BlurAt = Callable[[FieldPosition, Channel, float], UniformBlur]
+
+
+def psfs_of(
+    field: PsfField | PosteriorField, psf_error: float, lateral: LateralColour | None
+) -> tuple[PosteriorAt, BlurAt]:
+    """What is known of the PSF of one channel at one place; its blur when a share of it is used.
+
+    The rest of the kernel is a point: the residual of a wrong kernel does not count as noise, or strong edges
+    would be left to the prior, which spreads their colour over what lies beside them.
+    """
+
+    @lru_cache(maxsize=_KEPT)
+    def posterior_at(position: FieldPosition, channel: Channel) -> PsfPosterior:
+        if isinstance(field, PosteriorField):
+            return field.posterior_at(position, channel)
+        kernel = crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE))
+        return PsfPosterior.of_error(kernel, psf_error)
+
+    @lru_cache(maxsize=_KEPT)
+    def blur_at(position: FieldPosition, channel: Channel, share: float) -> UniformBlur:
+        kernel, offset = posterior_at(position, channel).kernel, (0.0, 0.0)
+        if share < 1.0:
+            kernel = as_kernel(share * kernel + (1.0 - share) * delta(kernel.shape[0]))
+        if lateral is not None and channel != "g":
+            outwards = lateral.displacement(position.r, channel)
+            offset = (-outwards * math.sin(position.phi), outwards * math.cos(position.phi))
+        return UniformBlur(kernel, offset)
+
+    return posterior_at, blur_at
 
 
 @dataclass(frozen=True, slots=True, eq=False)

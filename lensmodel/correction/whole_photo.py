@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 import logging
-import math
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from typing import Final
 
 import numpy as np
@@ -17,36 +16,17 @@ from numba.core import event
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
-from lensmodel.core.psf import PsfField, as_kernel, crop_to_support, delta
+from lensmodel.core.psf import PsfField
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import (
-    ZONES,
-    BayerPattern,
-    Channel,
-    FieldPosition,
-    Frame,
-    NoiseModel,
-    Planes,
-    StepHook,
-    Zone,
-    ignore_step,
-)
+from lensmodel.core.types import ZONES, BayerPattern, Frame, NoiseModel, Planes, StepHook, Zone, ignore_step
 from lensmodel.correction.audit import Audit
-from lensmodel.correction.blur import Real, UniformBlur, Window
-from lensmodel.correction.cell import (
-    BlurAt,
-    Cell,
-    CorrectionJob,
-    PosteriorAt,
-    RestoredCell,
-    cells,
-    restore_cell,
-)
+from lensmodel.correction.blur import Real, Window
+from lensmodel.correction.cell import Cell, CorrectionJob, RestoredCell, cells, psfs_of, restore_cell
 from lensmodel.correction.deconvolver import Deconvolver
 from lensmodel.correction.direct_filter import DirectFilter
 from lensmodel.correction.expected_gain import CellForecast
 from lensmodel.correction.limit import Bounds, StoredColour
-from lensmodel.correction.posterior import PosteriorField, PsfPosterior
+from lensmodel.correction.posterior import PosteriorField
 from lensmodel.correction.richardson_lucy import SaturationAwareRichardsonLucy
 from lensmodel.correction.sparse_gradient import SparseGradient
 from lensmodel.photo.lateral import LateralColour
@@ -61,10 +41,8 @@ deconvolvers: Registry[Deconvolver] = Registry(
 )
 """The deconvolution methods by name."""
 
-KERNEL_SIZE: Final = 55  # pixels: the largest kernel that the paper estimates
 _ENOUGH_CELLS, _MORE_CELLS = 24, 96  # to try of a photo: a tenth of the work; where too few decide (chosen)
 _SURE_DB: Final = 0.1
-_KEPT: Final = 640  # kernels to keep: three rows of cells of 100 megapixels
 
 _UNKNOWN: Final = 1.0
 """Expected error of a kernel at and above which no gain is predicted: all its power may be error (chosen)."""
@@ -167,7 +145,7 @@ def correct_planes(
         raise InvalidInputError(f"workers must be at least 1, got {workers}")
     job = CorrectionJob(
         planes,
-        *_psfs_of(field, psf_error, lateral),
+        *psfs_of(field, psf_error, lateral),
         frame,
         deconvolvers.resolve(method),
         strength,
@@ -204,35 +182,6 @@ def correct_planes(
         on_step(done, len(window_cells))
     step = (1, 1) if stored is None else stored.step
     return Corrected(out, zone_reports(forecasts, left), Audit.mean(audits), step, tuple(layer_planes))
-
-
-def _psfs_of(
-    field: PsfField | PosteriorField, psf_error: float, lateral: LateralColour | None
-) -> tuple[PosteriorAt, BlurAt]:
-    """What is known of the PSF of one channel at one place; its blur when a share of it is used.
-
-    The rest of the kernel is a point: the residual of a wrong kernel does not count as noise, or strong edges
-    would be left to the prior, which spreads their colour over what lies beside them.
-    """
-
-    @lru_cache(maxsize=_KEPT)
-    def posterior_at(position: FieldPosition, channel: Channel) -> PsfPosterior:
-        if isinstance(field, PosteriorField):
-            return field.posterior_at(position, channel)
-        kernel = crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE))
-        return PsfPosterior.of_error(kernel, psf_error)
-
-    @lru_cache(maxsize=_KEPT)
-    def blur_at(position: FieldPosition, channel: Channel, share: float) -> UniformBlur:
-        kernel, offset = posterior_at(position, channel).kernel, (0.0, 0.0)
-        if share < 1.0:
-            kernel = as_kernel(share * kernel + (1.0 - share) * delta(kernel.shape[0]))
-        if lateral is not None and channel != "g":
-            outwards = lateral.displacement(position.r, channel)
-            offset = (-outwards * math.sin(position.phi), outwards * math.cos(position.phi))
-        return UniformBlur(kernel, offset)
-
-    return posterior_at, blur_at
 
 
 def _unchanged(

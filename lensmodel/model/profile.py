@@ -33,6 +33,7 @@ _FORMAT: Final = 2  # raised when samples of before mean nothing to the model an
 _MAX_BYTES: Final = 1 << 30  # unpacked: against files made to fill the memory
 _MAX_SAMPLES: Final = 200_000  # some 700 photos of 96 patches in three colours (chosen: memory)
 _MAX_SIDE: Final = 255  # pixels (chosen): several times the widest kernels; more would fill the memory
+_MAX_NAME: Final = 200  # characters of a text
 _KERNELS, _ENCODED = "kernels.npy", "encoded.npy"
 _INFINITY: Final = "infinity"  # a focus distance for which JSON has no number
 
@@ -114,14 +115,15 @@ def _read(archive: zipfile.ZipFile, name: str) -> LensProfile:
             f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
             f"one is needed for each, of side {_MAX_SIDE} at most"
         )
-    samples = unpack_samples(PackedSamples(entries, stack, encoded))
+    excluded = document["model"].get("excluded", ())  # photos that earlier profiles leave out
+    samples = [s for s in unpack_samples(PackedSamples(entries, stack, encoded)) if s.photo not in excluded]
     model = LensModel.fit(samples, document["model"].get("mode", "default"))
     cameras = tuple(Camera(**_texts(camera)) for camera in document.get("cameras", []))
     return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]), cameras)
 
 
 def _texts(values: dict[str, Any]) -> dict[str, str]:
-    return {str(key)[:200]: str(value)[:200] for key, value in values.items()}
+    return {str(key)[:_MAX_NAME]: str(value)[:_MAX_NAME] for key, value in values.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,6 +196,7 @@ def sample_of(
         settings["focus_m"] = math.inf
     place = FieldPosition(float(entry["r"]), float(entry["phi"]))
     named = {name: entry[name] for name in _NAMED_ALIKE}
-    named |= {name: str(named[name]) for name in ("photo", "estimator")}
+    # bounded: one long name would lengthen those of all samples in an array of them
+    named |= {name: str(named[name])[:_MAX_NAME] for name in ("photo", "estimator")}
     values = np.asarray(kernel, dtype=np.float64)
     return PsfSample(values, place, LensSettings(**settings), encoded=encoded, **named)

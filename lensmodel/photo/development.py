@@ -269,9 +269,7 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: values.PhotoInfo) -> values
             white_balance=balance,
             to_srgb=to_srgb,
             xyz_to_camera=xyz_to_camera,
-            baseline_exposure=stops
-            if stops is not None and abs(stops) <= 10.0
-            else None,  # others are absurd
+            baseline_exposure=stops if stops is not None and abs(stops) <= 10.0 else None,  # others: absurd
             opcodes_2=opcodes,
             opcodes_3=tags.raw(OPCODES_3),
         ),

@@ -74,7 +74,7 @@ class Said:
             if header.directory:  # a preview may stand before the photo
                 main.update(reader.directory(header.directory)[0])
             main.update(reader.below(main, containers.EXIF))
-            note_in = reader if 0x927C in main else note_in
+            note_in = note_in or (reader if 0x927C in main else None)
             tags = Tags({**main, **tags})
         note = _maker_note(tags.text(0x010F) or "", tags[0x927C], note_in) if note_in else PhotoMetadata()
         return cls(header, tags, read_xmp(header.xmp), note)
@@ -88,6 +88,7 @@ class Said:
         speeds = _first_within(1.0, 65534.0, number(0x8827)), number(0x8832), number(0x8831), note.iso
         serials = text(0xA431), text(0xC62F), note.body_serial, xmp.get("aux:SerialNumber")
         stars = _first_within(-1, 5, _quotient(xmp.get("xmp:Rating")), number(0x4746))  # -1 is rejected
+        words = xmp.get("dc:subject", "").split("\n")
         return PhotoMetadata(
             camera_maker=text(0x010F) or xmp.get("tiff:Make"),
             camera_model=text(0x0110) or xmp.get("tiff:Model"),
@@ -101,10 +102,10 @@ class Said:
             taken_at=self._taken_at(),
             orientation=int(_first_within(1.0, 8.0, number(0x0112)) or 1),
             pixel_pitch_um=self.placed()[0],
-            artist=text(0x013B) or xmp.get("dc:creator"),
+            artist=text(0x013B) or xmp.get("dc:creator", "").replace("\n", ", ") or None,
             copyright=text(0x8298) or xmp.get("dc:rights"),
             rating=None if stars is None else int(stars),
-            keywords=tuple(xmp.get("dc:subject", "").splitlines()),
+            keywords=tuple(word for word in words if word and not _OF_PLACE.match(word)),
         )
 
     @property
@@ -264,19 +265,21 @@ _PROPERTY: Final = re.compile(
     rb"|[^<>=]{0,99}+>(?:\s{0,99}+<rdf:[^<>]{0,200}+>){0,3}([^<]{0,1024}+)<)"
 )
 """A property as attribute or element, under the prefix that all programs use: no entities, no recursion."""
-MAX_KEYWORDS: Final = 1 << 14  # bytes of their list (chosen)
+MAX_LIST: Final = 1 << 13  # bytes of authors or keywords (chosen: five times as many fit into a JPEG)
+_OF_PLACE: Final = re.compile(r"(?i)geo(:|tagged)")  # keywords of machines
 
 
 def read_xmp(packet: bytes | None) -> Mapping[str, str]:
-    """Read the properties of a packet by prefix and name: the first of a list, what is whole of damage."""
+    """Read the properties of a packet in UTF-8 by prefix and name; of a list the first, or lines."""
     properties = dict[str, str]()
     if packet and len(packet) <= MAX_XMP_BYTES and b"<!DOCTYPE" not in packet:
         for match in _PROPERTY.finditer(packet):
             if value := html.unescape(match[match.lastindex or 0].decode("utf-8", "replace")).strip():
                 properties.setdefault(match[1].decode(), value)
-        words = packet.partition(b"<dc:subject>")[2].partition(b"</dc:subject>")[0][:MAX_KEYWORDS]
-        if items := re.findall(r"<rdf:li[^<>]*>([^<]{1,1024})<", words.decode("utf-8", "replace")):
-            properties["dc:subject"] = "\n".join(map(html.unescape, items))
+        for name in ("dc:creator", "dc:subject"):
+            listed = packet.partition(f"<{name}>".encode())[2].partition(f"</{name}>".encode())[0][:MAX_LIST]
+            if items := re.findall(r"<rdf:li[^<>]*>([^<]{1,1024})<", listed.decode("utf-8", "replace")):
+                properties[name] = "\n".join(" ".join(html.unescape(item).split()) for item in items)
     return properties
 
 
@@ -361,6 +364,7 @@ _XMP_GPS: Final = re.compile(rb":[Gg][Pp][Ss]\w{1,40}" + _VALUE)
 _PACKED: Final = re.compile(rb"Raw profile type |XML:com\.adobe\.xmp\x00\x01")
 """How the text of a PNG chunk begins that holds metadata in a form that cannot be searched."""
 
+_MOST_OF_CHUNK: Final = 2 * containers.MAX_BLOCK_BYTES  # bytes of a chunk of a PNG that is searched
 _HIDDEN: Final = b"prVt"  # type of a chunk that every reader skips: ancillary, private, safe to copy
 
 
@@ -389,7 +393,8 @@ def find_location(buffer: Buffer) -> tuple[list[tuple[int, bytes]], bool]:
         start, end = match.span(match.lastindex or 0)
         spans.append((start, b" " * (end - start)))
     spans = [(at, data) for at, data in spans if bytes(buffer[at : at + len(data)]) != data]
-    return _with_checksums(buffer, chunks, spans), len(blocks) <= MAX_BLOCKS and len(words) <= MAX_WORDS
+    seen = len(blocks) <= MAX_BLOCKS and len(words) <= MAX_WORDS
+    return _with_checksums(buffer, chunks, spans), seen and all(n <= _MOST_OF_CHUNK for *_, n in chunks)
 
 
 def gps_directory(path: Path) -> dict[int, Value]:
@@ -428,7 +433,7 @@ def _with_checksums(
     """Renew the checksums of a PNG's chunks that change; hide those whose metadata cannot be searched."""
     renewed = list(spans)
     for name, start, length in chunks:
-        if length > 2 * containers.MAX_BLOCK_BYTES:
+        if length > _MOST_OF_CHUNK:
             continue
         chunk = bytearray(buffer[start - 4 : start + length])
         inside = [(at - start + 4, data) for at, data in spans if start <= at < start + length]

@@ -38,7 +38,7 @@ _XMP_TAG, _ICC_TAG, OPCODES_2, OPCODES_3 = 700, 34675, 51009, 51022
 _FROM_SRGB: Final = D65_TO_D50 @ SRGB_TO_XYZ_D65  # to XYZ under D50
 
 Pixels: TypeAlias = NDArray[Any]
-"""Numbers of a file, `(row, col, channel)`, uint8 or uint16."""
+"""Numbers of a file, `(row, col, channel)`, uint8, uint16 or float32."""
 
 
 def write_image(
@@ -78,7 +78,7 @@ def write_image(
     if (encoding.opcodes_2 or encoding.opcodes_3) and format != "dng":
         said = "%s: what the DNG leaves to raw converters to correct is not in it; only DNG output keeps that"
         remarks_log.warning(said, path.name)
-    clipped = encoding.bit_depth == 32 and format not in {"tiff32", "dng"}
+    clipped = encoding.bit_depth == 32 and format != "tiff32"
     if clipped and (beyond := 100.0 * float((planes > 1.0).mean())):
         said = "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them"
         remarks_log.warning(said, path.name, beyond)
@@ -284,12 +284,12 @@ def opcodes_of_planes(block: bytes, cfa: BayerPattern | None) -> tuple[bytes, in
         head = _GAIN_HEAD.unpack_from(data) if known else (0,) * 15
         (top, left, bottom, right), pitch, gains = head[:4], head[6:8], data[_GAIN_HEAD.size :]
         if pitch == (2, 2) and cfa is not None:
-            colour = cfa[top % 2][left % 2]
-            if colour == 1:
+            channel = cfa[top % 2][left % 2]
+            if channel == 1:
                 whole = np.frombuffer(gains[: len(gains) // 4 * 4], ">f4")
                 gains = np.sqrt(np.maximum(whole, 0.0)).astype(">f4").tobytes()
             # the two rows and columns between whose pixels the others stood
-            area = (top - top % 2, left - left % 2, bottom + bottom % 2, right + right % 2, colour, 1)
+            area = (top - top % 2, left - left % 2, bottom + bottom % 2, right + right % 2, channel, 1)
         elif pitch == (1, 1):
             area = (top, left, bottom, right, 0, 3)
         else:

@@ -148,7 +148,7 @@ def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int, *, measured
     figures = f"opposite sides differ by {sides:.0%}, give or take {spread:.0%}"
     signs = []
     if softer.significant and softer.amount > _SOFTER:
-        more = math.exp(softer.amount + softer.error) - math.exp(softer.amount)
+        more = math.exp(softer.amount + 2.0 * softer.error) - math.exp(softer.amount)
         signs.append(
             f"the {direction_in_words(softer.direction)} is softer than the opposite side, "
             f"its blur {1.0 + sides:.2f} times as wide, give or take {more:.2f}"

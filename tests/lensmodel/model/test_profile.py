@@ -207,3 +207,20 @@ def test_every_truncation_and_flipped_byte_is_refused_or_harmless(tmp_path: Path
         path.write_bytes(data)
         with contextlib.suppress(InvalidInputError):  # anything else fails the test
             assert len(Lens.load(path).model.samples) == 3
+
+
+def test_earlier_profiles_open_without_the_photos_that_they_leave_out(tmp_path: Path) -> None:
+    before = profile().model.samples
+    after = Lens.load(changed(tmp_path, {"model": {"excluded": ["p1"]}})).model
+
+    assert {sample.photo for sample in after.samples} == {sample.photo for sample in before} - {"p1"}
+
+
+def test_one_long_name_costs_no_memory(tmp_path: Path) -> None:
+    before = profile()
+    long = replace(before.model.samples[0], photo="x" * 1_000_000)
+    Lens(LensModel.fit([*before.model.samples[1:], long]), {}, {}).save(tmp_path / "long.lensprofile")
+
+    after = Lens.load(tmp_path / "long.lensprofile")
+
+    assert max(len(sample.photo) for sample in after.samples) == 200

@@ -27,7 +27,7 @@ from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo import containers
 from lensmodel.photo.containers import opened_header
 from lensmodel.photo.development import opened_raw
-from lensmodel.photo.metadata import Said, find_location, is_placeholder, read_xmp
+from lensmodel.photo.metadata import Said, find_location, is_placeholder, read_xmp, xmp_packet
 from lensmodel.photo.writing import write_bayer_dng
 
 # Lens names that EXPECTED.tsv gives from ExifTool's own tables, not from text in the file.
@@ -201,6 +201,14 @@ def test_a_damaged_xmp_packet_gives_what_came_before() -> None:
 
     assert read_xmp(packet[:-20])["aux:LensSerialNumber"] == "77"
     assert read_xmp(b"\xff\xfe nonsense") == {}
+
+
+def test_keywords_that_grow_when_they_are_written_fit_into_a_jpeg() -> None:
+    words = b"".join(b"<rdf:li>" + b"&" * 1000 + b"</rdf:li>" for _ in range(60))
+    read = tuple(read_xmp(b"<dc:subject>" + words)["dc:subject"].split("\n"))
+
+    assert 4 < len(read) < 60
+    assert len(xmp_packet(photo.PhotoMetadata(keywords=read), "")) < 65_000
 
 
 def test_keywords_that_never_end_cost_no_time() -> None:
@@ -407,6 +415,15 @@ def test_the_place_in_a_part_of_a_raw_file_goes_too(head: bytes, part: bytes) ->
 @pytest.mark.parametrize("kind", FILES)
 def test_photos_that_say_nothing_are_not_touched(kind: str) -> None:
     assert find_location(saved(kind)) == ([], True)
+
+
+def test_a_png_whose_text_is_too_large_to_be_searched_is_not_called_clean() -> None:
+    data, text = FILES["png"], bytes(17 << 20)
+    part = struct.pack(">I4s", len(text), b"tEXt") + text + struct.pack(">I", zlib.crc32(b"tEXt" + text))
+    at = data.index(b"IDAT") - 4
+
+    assert find_location(data)[1]
+    assert not find_location(data[:at] + part + data[at:])[1]
 
 
 def test_a_png_of_countless_empty_parts_costs_no_memory() -> None:

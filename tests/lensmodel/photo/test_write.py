@@ -439,7 +439,9 @@ XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.o
 xmp:Rating="{rating}">
 <dc:rights><rdf:Alt><rdf:li xml:lang="x-default">© Ä. Example</rdf:li></rdf:Alt></dc:rights>
 <dc:creator><rdf:Seq><rdf:li>Ä. Example</rdf:li><rdf:li>B. Example</rdf:li></rdf:Seq></dc:creator>
-<dc:subject><rdf:Bag><rdf:li>holiday</rdf:li><rdf:li>café &amp; sea</rdf:li></rdf:Bag></dc:subject>
+<dc:subject><rdf:Bag><rdf:li>holiday</rdf:li>
+<rdf:li>geo:lat=52.5163</rdf:li><rdf:li>Geotagged</rdf:li>
+<rdf:li>café &amp; sea</rdf:li></rdf:Bag></dc:subject>
 </rdf:Description></rdf:RDF></x:xmpmeta>"""
 
 
@@ -452,7 +454,7 @@ def corrected(source: Path, target: Path, output: photo.OutputFormat, **options:
 
 @pytest.mark.parametrize("rating", [-1, 0, 4])
 @pytest.mark.parametrize("output", [*FORMATS, "tiff32"])
-def test_rights_author_rating_and_keywords_of_xmp_are_kept(
+def test_rights_authors_rating_and_keywords_of_xmp_are_kept(
     output: photo.OutputFormat, rating: int, tmp_path: Path
 ) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
@@ -460,7 +462,7 @@ def test_rights_author_rating_and_keywords_of_xmp_are_kept(
 
     said = photo.inspect(corrected(tmp_path / "x.jpg", tmp_path / "out", output)).metadata
 
-    assert (said.copyright, said.artist, said.rating) == ("© Ä. Example", "Ä. Example", rating)
+    assert (said.copyright, said.artist, said.rating) == ("© Ä. Example", "Ä. Example, B. Example", rating)
     assert said.keywords == ("holiday", "café & sea")
 
 
